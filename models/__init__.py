@@ -1,0 +1,1 @@
+"""Robot files (URDF, MJCF, meshes) and named scenes."""

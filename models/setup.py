@@ -1,0 +1,50 @@
+"""A named scene ready to run: what, from where, for how long, and which numbers to report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.rollout import Rollout
+from pbfd_torch.simulator import Scene
+
+Metric = float | list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Attributes:
+    scene: what is simulated.
+    q, v: start `[worlds, nq]`, `[worlds, nv]`.
+    duration: [s] that the scene is meant to run.
+    dt: step [s] that suits it.
+    metrics: rollout → named numbers, a list having one entry per world.
+    notes: what a reader of the result should know.
+    """
+
+    scene: Scene
+    q: Tensor
+    v: Tensor
+    duration: float
+    dt: float
+    metrics: Callable[[Rollout], Mapping[str, Metric]] = field(default=lambda rollout: {})
+    notes: Sequence[str] = ()
+
+    @property
+    def worlds(self) -> int:
+        return len(self.q)
+
+
+def repeated(row: Tensor, worlds: int) -> Tensor:
+    """`[n] → [worlds, n]`, a copy."""
+    return row.expand(worlds, -1).clone()
+
+
+def tilted(angle: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Quaternion of a rotation by `angle` [rad] about +y: a body along +x dips its far end for angles > 0."""
+    half = torch.tensor(0.5 * angle, dtype=dtype, device=device)
+    zero = torch.zeros_like(half)
+    return torch.stack((torch.cos(half), zero, torch.sin(half), zero))

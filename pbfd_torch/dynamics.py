@@ -1,0 +1,88 @@
+"""The equations of motion as functions: mass matrix, inverse dynamics, forward dynamics, energy and momentum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.assembly import assemble, link_residual, subtree_sums
+from pbfd_torch.kinematics import Placement, place, pose_rates
+from pbfd_torch.rotations import unskew
+from pbfd_torch.terms.inertia import inertia_stiffness
+from pbfd_torch.terms.joint_springs import Armature
+from pbfd_torch.terms.load import LinkLoad, Term
+
+
+def armature_diagonal(articulation: Articulation, terms: Sequence[Term]) -> Tensor:
+    """Sum of the armatures among the terms, `[*, nv]`."""
+    total = torch.zeros(articulation.nv, dtype=articulation.dtype, device=articulation.device)
+    for term in terms:
+        if isinstance(term, Armature):
+            total = total + term.inertia
+    return total
+
+
+def mass_matrix(articulation: Articulation, q: Tensor, terms: Sequence[Term] = ()) -> Tensor:
+    """Joint-space mass matrix M(q) `[*batch, nv, nv]`; `terms` may hold armatures, which add to its diagonal."""
+    placement = place(articulation, q)
+    second = placement.poses @ articulation.pseudo_inertia @ placement.poses.mT
+    still = torch.zeros_like(second[..., :3, :])
+    inertia = assemble(placement, [LinkLoad(still, inertia_stiffness(second))]).jacobian
+    return inertia + torch.diag_embed(armature_diagonal(articulation, terms))
+
+
+def _acceleration_load(placement: Placement, acceleration: Tensor) -> LinkLoad:
+    """Load of inertia for given second derivatives of the link poses `[*batch, nlink, 3, 4]`."""
+    moment = acceleration @ (placement.poses @ placement.articulation.pseudo_inertia).mT
+    return LinkLoad(moment, moment.new_zeros((*moment.shape[:-2], 6, 6)))
+
+
+def bias_force(articulation: Articulation, q: Tensor, v: Tensor, gravity: Tensor) -> Tensor:
+    """Coriolis, centrifugal and gravity forces h(q, v) `[*batch, nv]` in M v̇ + h = τ; gravity `[*, 3]` [m/s²]."""
+    placement = place(articulation, q)
+    _, drift = pose_rates(placement, v)
+    fall = torch.zeros_like(drift)
+    fall[..., 3] = gravity[..., None, :]
+    moment, _ = subtree_sums(placement, [_acceleration_load(placement, drift - fall)])
+    return link_residual(placement, moment)
+
+
+def inverse_dynamics(
+    articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, gravity: Tensor, terms: Sequence[Term] = ()
+) -> Tensor:
+    """Generalised force τ = M(q) v̇ + h(q, v) `[*batch, nv]` for acceleration v̇ `[*batch, nv]`."""
+    inertia = (mass_matrix(articulation, q, terms) @ acceleration[..., None]).squeeze(-1)
+    return inertia + bias_force(articulation, q, v, gravity)
+
+
+def center_of_mass(placement: Placement) -> Tensor:
+    """Centre of mass of the whole articulation [m] `[*batch, 3]`."""
+    first = (placement.poses @ placement.articulation.pseudo_inertia)[..., :3, 3].sum(-2)
+    return first / placement.articulation.mass.sum(-1, keepdim=True)
+
+
+def momentum(placement: Placement, rates: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear momentum [kg m/s] and angular momentum about the centre of mass [kg m²/s], each `[*batch, 3]`, for link poses that change
+    at `rates` Ṫ `[*batch, nlink, 3, 4]`: the integrals of ρ ṗ and ρ p × ṗ over the bodies."""
+    first = (rates @ (placement.poses @ placement.articulation.pseudo_inertia).mT).sum(-3)
+    linear = first[..., 3]
+    return linear, unskew(first[..., :3]) - torch.linalg.cross(center_of_mass(placement), linear)
+
+
+def kinetic_energy(articulation: Articulation, rates: Tensor) -> Tensor:
+    """∫ρ ṗ²/2 over all links [J] `[*batch]`, for link poses that change at `rates` Ṫ `[*batch, nlink, 3, 4]`."""
+    return 0.5 * ((rates @ articulation.pseudo_inertia) * rates).sum((-3, -2, -1))
+
+
+def rotor_energy(articulation: Articulation, v: Tensor, terms: Sequence[Term]) -> Tensor:
+    """Kinetic energy of the armatures among the terms [J] `[*batch]`."""
+    return 0.5 * (armature_diagonal(articulation, terms) * v * v).sum(-1)
+
+
+def potential_energy(placement: Placement, gravity: Tensor) -> Tensor:
+    """−m g · x of the centre of mass [J] `[*batch]`: zero at the world's origin."""
+    mass = placement.articulation.mass.sum(-1)
+    return -mass * (gravity * center_of_mass(placement)).sum(-1)

@@ -1,0 +1,23 @@
+"""The exceptions of the library: every message names the value, the range and the valid choices."""
+
+from __future__ import annotations
+
+
+class PbfdError(Exception):
+    """Base of everything this library raises on purpose."""
+
+
+class InputError(PbfdError, ValueError):
+    """A value, shape, dtype, device or option that cannot be used."""
+
+
+class ModelError(PbfdError, ValueError):
+    """A robot that cannot be simulated: names the file (where there is one), the element and the reason."""
+
+    def __init__(self, reason: str, *, element: str = "", file: str = "") -> None:
+        self.reason, self.element, self.file = reason, element, file
+        super().__init__(": ".join(part for part in (file, element, reason) if part))
+
+
+class NotModelledWarning(UserWarning):
+    """Something that a file asks for and that the simulation leaves out; given once per file and feature."""

@@ -1,0 +1,172 @@
+"""Forward kinematics: q → node and link poses, motion axes, twists; and the manifold's retract and difference.
+
+All functions take any batch shape; batch dimensions of the articulation's parameters and of q broadcast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, homogeneous
+from pbfd_torch.rotations import (
+    quaternion_conjugate,
+    quaternion_exp,
+    quaternion_log,
+    quaternion_matrix,
+    quaternion_multiply,
+    quaternion_normalize,
+    skew,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """An articulation placed at a configuration.
+
+    Attributes:
+        articulation: what is placed.
+        q: `[*batch, nq]` the configuration.
+        nodes: `[*batch, nnode, 4, 4]` world pose of every node (node 0: the world).
+        poses: `[*batch, nlink, 4, 4]` world pose of every link.
+    """
+
+    articulation: Articulation
+    q: Tensor
+    nodes: Tensor
+    poses: Tensor
+
+    @cached_property
+    def axes(self) -> Tensor:
+        """Unit twists s_i = (ω_i, v_i) of all degrees of freedom `[*batch, nv, 6]`, v taken at the world origin."""
+        return motion_axes(self.articulation, self.nodes)
+
+
+def place(articulation: Articulation, q: Tensor) -> Placement:
+    """Poses of all nodes and links at q `[*batch, nq]`."""
+    nodes = node_poses(articulation, q)
+    poses = nodes[..., articulation.topology.link_node_index, :, :] @ articulation.link_frame
+    return Placement(articulation, q, nodes, poses)
+
+
+def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
+    """Pose of every joint on its previous node, `[*batch, njoint, 4, 4]`."""
+    t = articulation.topology
+    groups = []
+    if len(t.scalar_joint):
+        x = q[..., t.scalar_q] - articulation.joint_ref[..., t.scalar_joint]
+        half_sine = torch.sin(0.5 * x)
+        a = torch.where(t.scalar_is_hinge, torch.sin(x), x)[..., None, None]
+        b = (2 * half_sine * half_sine)[..., None, None]  # 1 − cos x without cancellation; E₂ is zero for slides
+        constant, first, second = articulation.joint_basis()
+        groups.append(constant + a * first + b * second)
+    if len(t.turning_joint):
+        position = q.new_zeros((*q.shape[:-1], len(t.turning_joint), 3))
+        if len(t.free_q):
+            position[..., t.moving, :] = q[..., t.free_q]
+        turned = homogeneous(quaternion_matrix(q[..., t.turning_q]), position)
+        groups.append(articulation.joint_frame[..., t.turning_joint, :, :] @ turned)
+    if len(groups) == 1:
+        return groups[0]
+    batch = torch.broadcast_shapes(*(g.shape[:-3] for g in groups))
+    local = torch.cat([g.expand(*batch, *g.shape[-3:]) for g in groups], -3)
+    return local if t.node_order is None else local[..., t.node_order, :, :]
+
+
+def node_poses(articulation: Articulation, q: Tensor) -> Tensor:
+    """World poses of the nodes `[*batch, nnode, 4, 4]`, composed along the tree in log₂(depth) rounds."""
+    local = _local_poses(articulation, q)
+    world = torch.eye(4, dtype=q.dtype, device=q.device).expand(*local.shape[:-3], 1, 4, 4)
+    nodes = torch.cat((world, local), -3)
+    for ancestor in articulation.topology.jumps:
+        nodes = nodes[..., ancestor, :, :] @ nodes
+    return nodes
+
+
+def motion_axes(articulation: Articulation, nodes: Tensor) -> Tensor:
+    """World unit twists (ω, v at the world origin) of all degrees of freedom, `[*batch, nv, 6]` (METHOD §3)."""
+    t = articulation.topology
+    local = local_twists(articulation)
+    frame = nodes[..., t.dof_node, :3, :]
+    turned = frame[..., :3] @ local  # columns ω, v
+    omega, v = turned.unbind(-1)
+    return torch.cat((omega, v + torch.linalg.cross(frame[..., 3], omega)), -1)
+
+
+def local_twists(articulation: Articulation) -> Tensor:
+    """Unit twists in the frame of `dof_node`, `[*, nv, 3, 2]` with columns (ω, v)."""
+    t = articulation.topology
+    axis = articulation.joint_axis[..., t.scalar_joint, :]
+    zero = torch.zeros_like(axis)
+    hinge = t.scalar_is_hinge[:, None]
+    scalar = torch.stack((torch.where(hinge, axis, zero), torch.where(hinge, zero, axis)), -1)
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device).expand(*axis.shape[:-2], 3, 3)
+    flat = torch.zeros_like(eye)
+    moving = torch.stack((flat, eye), -1).repeat(*[1] * (axis.ndim - 2), len(t.free_v), 1, 1)
+    turning = torch.stack((eye, flat), -1).repeat(*[1] * (axis.ndim - 2), len(t.turning_v), 1, 1)
+    return torch.cat((scalar, moving, turning), -3)[..., t.v_order, :, :]
+
+
+def link_jacobians(placement: Placement) -> Tensor:
+    """World twist of every link per unit velocity of every degree of freedom, `[*batch, nlink, 6, nv]`."""
+    moves = placement.articulation.topology.moves_link.to(placement.q.dtype)
+    return placement.axes.mT[..., None, :, :] * moves[:, None, :]
+
+
+def link_twists(placement: Placement, v: Tensor) -> Tensor:
+    """World twists (ω, v at the world origin) of all links at velocity v `[*batch, nv]`: `[*batch, nlink, 6]`."""
+    moves = placement.articulation.topology.moves_link.to(placement.q.dtype)
+    return moves.expand(*v.shape[:-1], *moves.shape) @ (placement.axes * v[..., None])
+
+
+def pose_rates(placement: Placement, v: Tensor) -> tuple[Tensor, Tensor]:
+    """First derivative of all link poses, and the second one at zero generalised acceleration, each `[*batch, nlink, 3, 4]`.
+
+    With the twist V of a link Ṫ = [V]T, and T̈ = ([V̇] + [V]²)T, where V̇ = Σ ṡ_i v_i and ṡ_i = ad(V_carrier) s_i."""
+    t = placement.articulation.topology
+    axes = placement.axes
+    moving = axes * v[..., None]
+    carriers = t.carries.T.to(v.dtype)
+    carrier = carriers.expand(*v.shape[:-1], *carriers.shape) @ moving
+    rate = torch.cat(
+        (
+            torch.linalg.cross(carrier[..., :3], axes[..., :3]),
+            torch.linalg.cross(carrier[..., :3], axes[..., 3:]) + torch.linalg.cross(carrier[..., 3:], axes[..., :3]),
+        ),
+        -1,
+    )
+    moves = t.moves_link.to(v.dtype)
+    drift = moves.expand(*v.shape[:-1], *moves.shape) @ (rate * v[..., None])
+    twist = link_twists(placement, v)
+    velocity = torch.cat((skew(twist[..., :3]), twist[..., 3:, None]), -1) @ placement.poses
+    turn = skew(twist[..., :3])
+    second = torch.cat((skew(drift[..., :3]), drift[..., 3:, None]), -1) @ placement.poses + turn @ velocity
+    return velocity, second
+
+
+def retract(articulation: Articulation, q: Tensor, delta: Tensor) -> Tensor:
+    """q moved by the tangent vector `delta` `[*batch, nv]`: sums, and q ⊗ exp(δ) for rotations. Quaternions come out at unit norm."""
+    t = articulation.topology
+    parts = [q[..., t.scalar_q] + delta[..., t.scalar_v]]
+    if len(t.free_q):
+        parts.append((q[..., t.free_q] + delta[..., t.free_v]).flatten(-2))
+    if len(t.turning_q):
+        turned = quaternion_multiply(q[..., t.turning_q], quaternion_exp(delta[..., t.turning_v]))
+        parts.append(quaternion_normalize(turned).flatten(-2))
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.q_order]
+
+
+def difference(articulation: Articulation, start: Tensor, end: Tensor) -> Tensor:
+    """Tangent vector `[*batch, nv]` that takes `start` to `end`: retract(start, difference(start, end)) = end. Angles of ball and
+    free joints come out in [0, π]; hinge angles are plain differences."""
+    t = articulation.topology
+    parts = [end[..., t.scalar_q] - start[..., t.scalar_q]]
+    if len(t.free_q):
+        parts.append((end[..., t.free_q] - start[..., t.free_q]).flatten(-2))
+    if len(t.turning_q):
+        between = quaternion_multiply(quaternion_conjugate(start[..., t.turning_q]), end[..., t.turning_q])
+        parts.append(quaternion_log(between).flatten(-2))
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.v_order]

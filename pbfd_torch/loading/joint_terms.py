@@ -1,0 +1,93 @@
+"""What both formats give to joints: the terms a robot needs, and the check that every joint has something to move."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, Link
+from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.errors import ModelError
+from pbfd_torch.terms.joint_dry_friction import JointDryFriction
+from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings, checked_coefficient
+from pbfd_torch.terms.load import Term
+
+_SMALLEST = 1e-14  # inertia of a joint, relative to the robot's largest, that is a rounding error of zero
+
+
+@dataclass(frozen=True)
+class JointProperties:
+    """Numbers of one joint, the same for all its degrees of freedom. SI units of torque or force per coordinate."""
+
+    armature: float = 0.0
+    damping: float = 0.0
+    stiffness: float = 0.0
+    dry_friction: float = 0.0
+    spring_rest: Sequence[float] = field(default_factory=tuple)  # coordinates; empty: the reference configuration
+
+    def check(self, joint: str) -> None:
+        """Raises `ModelError` naming the joint for a number that is negative or not finite."""
+        for what in ("armature", "damping", "stiffness", "dry_friction"):
+            value = getattr(self, what)
+            if not (math.isfinite(value) and value >= 0):
+                raise ModelError(f"{what.replace('_', ' ')} is {value}: must be ≥ 0 and finite", element=f"joint '{joint}'")
+
+
+def articulate(
+    links: Sequence[Link], properties: dict[str, JointProperties], gravity: float, dtype: torch.dtype, device: torch.device | str
+) -> tuple[Articulation, tuple[Term, ...]]:
+    """The articulation and its joint terms, checked in 64 bits before they are rounded to `dtype`."""
+    exact = Articulation.from_links(links)
+    require_inertia(exact, joint_terms(exact, properties, gravity))
+    articulation = exact.to(dtype, device)
+    return articulation, joint_terms(articulation, properties, gravity)
+
+
+def joint_terms(articulation: Articulation, properties: dict[str, JointProperties], gravity: float) -> tuple[Term, ...]:
+    """Armature, damping, springs, dry friction and limits, each only if some joint has it. `gravity`: its size [m/s²]."""
+    t = articulation.topology
+    each = [properties.get(name, JointProperties()) for name in t.joint_names]
+    for name, joint in zip(t.joint_names, each, strict=True):
+        joint.check(name)
+
+    def spread(what: str) -> Tensor:
+        values = [getattr(each[j], what) for j in t.dof_joints]
+        return checked_coefficient(articulation, torch.tensor(values, dtype=articulation.dtype), what)
+
+    armature, damping, stiffness, friction = (spread(x) for x in ("armature", "damping", "stiffness", "dry_friction"))
+    terms: list[Term] = []
+    if armature.any():
+        terms.append(Armature(armature))
+    if damping.any():
+        terms.append(JointDamping(damping))
+    if stiffness.any():
+        rest = articulation.rest.clone()
+        for joint, start in zip(each, t.q_start, strict=True):
+            rest[start : start + len(joint.spring_rest)] = rest.new_tensor(joint.spring_rest)
+        terms.append(JointSprings(stiffness, rest))
+    if friction.any():
+        terms.append(JointDryFriction(friction))
+    if torch.isfinite(torch.cat((articulation.lower, articulation.upper))).any():
+        terms.append(JointLimits.for_articulation(articulation, gravity))
+    return tuple(terms)
+
+
+def require_inertia(articulation: Articulation, terms: Sequence[Term] = ()) -> None:
+    """Raises `ModelError` naming the first joint that can move without moving any mass (at the reference configuration, armatures
+    among `terms` included): its acceleration would not be determined."""
+    t = articulation.topology
+    with torch.no_grad():
+        inertia = mass_matrix(articulation, articulation.rest, terms).diagonal()
+    resting = (inertia <= _SMALLEST * inertia.max()).tolist()
+    if not any(resting):
+        return
+    j = t.dof_joints[resting.index(True)]
+    link, joint = t.link_names[t.joint_link[j]], t.joint_names[j]
+    carried = articulation.mass[..., t.subtree[j]].sum()
+    what = "have no mass" if carried == 0 else "have all their mass on the axis and no inertia about it"
+    raise ModelError(f"link '{link}' and everything it carries {what}: joint '{joint}' has no inertia")

@@ -1,0 +1,50 @@
+"""How loaders speak: errors that name the file, and lines on what is left out."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
+
+
+def existing_file(path: str | os.PathLike[str]) -> Path:
+    """`path` as an existing, non-empty file; raises `ModelError` saying which of these it is not."""
+    file = Path(path)
+    if file.is_dir():
+        raise ModelError("is a directory: must be a file", file=str(file))
+    if not file.is_file():
+        raise ModelError("no such file", file=str(file))
+    if file.stat().st_size == 0:
+        raise ModelError("the file is empty", file=str(file))
+    return file
+
+
+@contextmanager
+def naming(file: str, element: str = "") -> Iterator[None]:
+    """Adds the file, and where it is missing the element, to errors raised inside."""
+    try:
+        yield
+    except ModelError as error:
+        raise ModelError(error.reason, element=error.element or element, file=error.file or file) from error
+    except InputError as error:
+        raise ModelError(str(error), element=element, file=file) from error
+
+
+def listing(names: Iterable[str], most: int = 5) -> str:
+    """«a, b, c and 4 more»."""
+    every = list(names)
+    rest = len(every) - most
+    return ", ".join(every) if rest <= 1 else f"{', '.join(every[:most])} and {rest} more"
+
+
+def warn_not_modelled(file: Path, lines: Sequence[str]) -> tuple[str, ...]:
+    """One `NotModelledWarning` a line, and the lines without repetitions. Python shows a warning of one text from one place
+    once, so each file and feature is shown once in a process."""
+    unique = tuple(dict.fromkeys(lines))
+    for line in unique:
+        warnings.warn(f"{file}: not modelled: {line}", NotModelledWarning, stacklevel=2)
+    return unique

@@ -1,0 +1,47 @@
+"""What a robot file becomes: an articulation, the effects at its joints, its collision shapes and its named states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.terms.load import Term
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A named state: q `[nq]`, v `[nv]`, control `[nu]`."""
+
+    q: Tensor
+    v: Tensor
+    control: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """Attributes:
+    name: as the file says.
+    articulation: links and joints.
+    joint_terms: armature, damping, springs, dry friction and limits, each present only if the file asks for it.
+    actuators: None where there is none; their order is the order of the control vector.
+    colliders: collision shapes on links.
+    obstacles: flat obstacles that the file itself contains.
+    gravity: [m/s²].
+    keyframes: named states.
+    not_modelled: what the file asks for and the simulation leaves out, one line each.
+    """
+
+    name: str
+    articulation: Articulation
+    joint_terms: tuple[Term, ...] = ()
+    actuators: Actuators | None = None
+    colliders: tuple[Collider, ...] = ()
+    obstacles: tuple[HalfSpace, ...] = ()
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    keyframes: dict[str, Keyframe] = field(default_factory=dict)
+    not_modelled: tuple[str, ...] = ()

@@ -1,0 +1,48 @@
+"""The balance of forces at the end of a step, as a solver sees it: residual, Jacobian, retract (the root of Eq. 13)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.assembly import Balance, assemble
+from pbfd_torch.kinematics import place, retract
+from pbfd_torch.terms.load import OneSided, StepContext, Term
+
+
+@dataclass(frozen=True, eq=False)
+class BalanceObjective:
+    """r(θ) of one step for all worlds. `scale` `[*batch, nv]`: the size of a force that counts as one, see `force_scale`."""
+
+    articulation: Articulation
+    terms: Sequence[Term]
+    prepared: Sequence[Any]
+    scale: Tensor
+
+    @staticmethod
+    def of_step(articulation: Articulation, terms: Sequence[Term], step: StepContext, scale: Tensor) -> BalanceObjective:
+        """Prepares every term for the step."""
+        return BalanceObjective(articulation, terms, [term.prepare(step) for term in terms], scale)
+
+    def evaluate(self, q: Tensor) -> Balance:
+        """Residual, Jacobian and stiffness at q."""
+        placement = place(self.articulation, q)
+        return assemble(placement, [t.load(p, placement) for t, p in zip(self.terms, self.prepared, strict=True)])
+
+    def retract(self, q: Tensor, step: Tensor) -> Tensor:
+        """q moved by the tangent vector `step`."""
+        return retract(self.articulation, q, step)
+
+    def turn(self, step: Tensor) -> Tensor:
+        """Largest rotation [rad] of one joint in a tangent step, `[*batch]`."""
+        return (step.abs() * self.articulation.topology.turns.to(step.dtype)).amax(-1)
+
+    def softened(self, factor: float) -> BalanceObjective:
+        """The same step with contacts and joint limits `factor` times as stiff."""
+        softer = [term.softened(factor) if isinstance(term, OneSided) else term for term in self.terms]
+        return dataclasses.replace(self, terms=softer)

@@ -1,0 +1,95 @@
+"""Builds the record of a rollout, step by step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy, rotor_energy
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.kinematics import place
+from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.rollout import Rollout
+from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.load import Conservative
+
+if TYPE_CHECKING:
+    from pbfd_torch.simulator import Scene
+
+
+class Recorder:
+    """Collects one entry per step; `finish` stacks them."""
+
+    def __init__(self, scene: Scene, integrator: ImplicitEuler, dt: float, state: State) -> None:
+        self._scene, self._integrator, self._dt = scene, integrator, dt
+        self._entries: dict[str, list[Tensor]] = {}
+        self.steps = 0
+        self._add_state(state)
+
+    def _add(self, **entries: Tensor) -> None:
+        for name, value in entries.items():
+            self._entries.setdefault(name, []).append(value)
+
+    def _add_state(self, state: State) -> None:
+        scene = self._scene
+        a = scene.articulation
+        dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
+        v = self._integrator.velocity(a, state, dt)
+        placement = place(a, state.q)
+        rates = self._integrator.pose_rates(a, state, dt)
+        linear, angular = momentum(placement, rates)
+        potential = potential_energy(placement, scene.gravity)
+        for term in scene.terms:
+            if isinstance(term, Conservative):
+                potential = potential + term.potential(placement)
+        self._add(
+            q=state.q,
+            v=v,
+            link_poses=placement.poses[..., :3, :],
+            center_of_mass=center_of_mass(placement),
+            kinetic_energy=kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
+            potential_energy=potential,
+            linear_momentum=linear,
+            angular_momentum=angular,
+        )
+
+    def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
+        """One solved step: the state after it, how it was solved, and its contacts."""
+        self._add_state(state)
+        self._add(
+            status=solution.status,
+            iterations=solution.iterations,
+            evaluations=solution.evaluations,
+            residual_norm=solution.residual_norm,
+        )
+        pairs = zip(objective.terms, objective.prepared, strict=True)
+        contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact)]
+        placement = place(self._scene.articulation, state.q)
+        points = [term.points(prepared, placement) for term, prepared in contacts]
+        if points:
+            self._add(
+                contact_point=torch.cat([x.point for x in points], -2),
+                contact_depth=torch.cat([x.depth for x in points], -1),
+                contact_force=torch.cat([x.force for x in points], -2),
+            )
+        self.steps += 1
+
+    def finish(self) -> Rollout:
+        """The record so far."""
+        stacked = {name: torch.stack(values) for name, values in self._entries.items()}
+        like = stacked["q"]
+        if "contact_depth" not in stacked:
+            empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
+            stacked |= {"contact_point": empty[..., None].expand(*empty.shape, 3), "contact_depth": empty}
+            stacked["contact_force"] = stacked["contact_point"]
+        return Rollout(
+            scene_name=self._scene.name,
+            dt=self._dt,
+            link_names=self._scene.articulation.link_names,
+            joint_names=self._scene.articulation.joint_names,
+            time=self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device),
+            **stacked,
+        )

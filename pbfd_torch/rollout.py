@@ -1,0 +1,118 @@
+"""The record of a rollout: states, contacts and how each step was solved; saved as plain arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.solvers.objective import Status
+
+FORMAT = "pbfd_torch rollout 1"
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """All arrays run over time first: `T` steps give `T + 1` states and `T` solves. SI units, world coordinates.
+
+    Attributes:
+        scene_name, dt, link_names, joint_names: what was simulated, and the step [s].
+        time: `[T + 1]` [s].
+        q: `[T + 1, *batch, nq]`.
+        v: `[T + 1, *batch, nv]` average velocity over the step that ends at `time` (Eq. 3); entry 0 is that of the virtual step before
+            the start, which differs from the given velocity by half a step's acceleration.
+        link_poses: `[T + 1, *batch, nlink, 3, 4]` [R | t].
+        center_of_mass: `[T + 1, *batch, 3]`.
+        kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; potential: gravity, springs, limits and the contacts' normal forces.
+        linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
+        status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
+        contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
+            `[T, *batch, npoint, 3]` on the body.
+    """
+
+    scene_name: str
+    dt: float
+    link_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    time: Tensor
+    q: Tensor
+    v: Tensor
+    link_poses: Tensor
+    center_of_mass: Tensor
+    kinetic_energy: Tensor
+    potential_energy: Tensor
+    linear_momentum: Tensor
+    angular_momentum: Tensor
+    status: Tensor
+    iterations: Tensor
+    evaluations: Tensor
+    residual_norm: Tensor
+    contact_point: Tensor
+    contact_depth: Tensor
+    contact_force: Tensor
+
+    @property
+    def steps(self) -> int:
+        return len(self.status)
+
+    @property
+    def energy(self) -> Tensor:
+        """Kinetic plus potential energy [J] `[T + 1, *batch]`."""
+        return self.kinetic_energy + self.potential_energy
+
+    @property
+    def penetration(self) -> Tensor:
+        """Deepest penetration [m] `[T, *batch]`, 0 where nothing touches."""
+        if self.contact_depth.shape[-1] == 0:
+            return self.contact_depth.new_zeros(self.contact_depth.shape[:-1])
+        return self.contact_depth.amax(-1).clamp_min(0)
+
+    @property
+    def solved(self) -> Tensor:
+        """`[T, *batch]` bool."""
+        return self.status <= int(Status.CONTINUED)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all. Raises
+        `InputError` where it cannot be written."""
+        target = Path(path)
+        meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt}
+        meta |= {"link_names": list(self.link_names), "joint_names": list(self.joint_names)}
+        arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS}
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".part", delete=False) as file:
+                np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
+            os.replace(file.name, target)
+        except OSError as error:
+            raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Rollout:
+        """Reads what `save` wrote; never unpickles. Raises `InputError` for a missing, damaged or foreign file."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                meta = json.loads(str(file["meta"]))
+                if meta.get("format") != FORMAT:
+                    raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
+                arrays = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
+        except FileNotFoundError as error:
+            raise InputError(f"no rollout at '{path}'") from error
+        except (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"'{path}' is not a readable rollout: {error}") from error
+        names = {key: tuple(meta[key]) for key in ("link_names", "joint_names")}
+        return Rollout(scene_name=meta["scene_name"], dt=float(meta["dt"]), **names, **arrays)
+
+
+_ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]

@@ -1,0 +1,165 @@
+"""Scene and simulator: one step, and a rollout, for any batch of worlds at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, force_scale
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.errors import InputError, ModelError
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.recording import Recorder
+from pbfd_torch.rollout import Rollout
+from pbfd_torch.solvers.continuation import Continuation
+from pbfd_torch.solvers.objective import Objective, Solution
+from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.terms.load import StepContext, Term
+
+
+class Solver(Protocol):
+    """What finds the end of a step."""
+
+    def solve(self, objective: Objective, guess: Tensor, retreat: Tensor | None = None) -> Solution:
+        """Root of the objective for every world, from `guess`, or from `retreat` where that is the safer start."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """An articulation, everything that acts on it, and where it is. What is not in `terms` costs nothing.
+
+    Attributes:
+        articulation: the bodies.
+        terms: physical effects; `Inertia()` must be among them.
+        gravity: `[3]` or `[*batch, 3]` [m/s²].
+        colliders, obstacles: geometry, for pictures and records; the contact terms hold what they need of it.
+        name: for records.
+    """
+
+    articulation: Articulation
+    terms: Sequence[Term]
+    gravity: Tensor
+    colliders: Sequence[Collider] = ()
+    obstacles: Sequence[HalfSpace] = ()
+    name: str = "scene"
+
+    def __post_init__(self) -> None:
+        a = self.articulation
+        if self.gravity.shape[-1:] != (3,) or not bool(torch.isfinite(self.gravity).all()):
+            raise InputError(f"gravity is {self.gravity.tolist()}: must be finite with last dimension 3")
+        if self.gravity.dtype != a.dtype or self.gravity.device != a.device:
+            raise InputError(f"gravity is {self.gravity.dtype} on {self.gravity.device}: must be {a.dtype} on {a.device}")
+        inertia = mass_matrix(a, a.rest, self.terms).detach().diagonal(dim1=-2, dim2=-1).reshape(-1, a.nv).amin(0)
+        for i, joint in enumerate(a.topology.dof_joints):
+            if not float(inertia[i]) > 0:
+                raise ModelError(
+                    "nothing that it moves has any inertia about its axis, and it has no armature",
+                    element=f"joint '{a.joint_names[joint]}'",
+                )
+
+    @property
+    def nu(self) -> int:
+        """Length of the control vector."""
+        return sum(term.nu for term in self.terms if isinstance(term, Actuators))
+
+
+class Simulator:
+    """Steps a scene. `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions' differences."""
+
+    def __init__(self, scene: Scene, dt: float, integrator: ImplicitEuler | None = None, solver: Solver | None = None) -> None:
+        if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt >= 1e-5):
+            raise InputError(f"dt is {dt} s: must be a finite number ≥ 1e-5")
+        a = scene.articulation
+        self.scene = scene
+        self.dt = float(dt)
+        self.integrator = integrator or ImplicitEuler()
+        self.solver: Solver = solver or Continuation()
+        self._dt = torch.tensor(dt, dtype=a.dtype, device=a.device)
+        self._scale = force_scale(a, float(torch.linalg.vector_norm(scene.gravity, dim=-1).max()))
+
+    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> State:
+        """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).
+
+        The start is of second order: the acceleration comes from a trial step, so stiff contacts are felt as they will be. A world
+        whose trial step does not solve starts at first order. Raises `InputError` for wrong shapes, dtypes, devices or NaN."""
+        a = self.scene.articulation
+        q = a.rest if q is None else self._checked(q, a.nq, "q")
+        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
+        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1])
+        q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
+        q = a.topology.normalized(q)
+        still = self.integrator.start(a, q, v, torch.zeros_like(v), self._dt)
+        trial, solution = self.step(still, control)
+        gained = self.integrator.velocity(a, trial, self._dt) - v
+        acceleration = torch.where(solution.solved[..., None], gained / self._dt, 0.0)
+        return self.integrator.start(a, q, v, acceleration, self._dt)
+
+    def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
+        a = self.scene.articulation
+        if value.ndim == 0 or value.shape[-1] != length:
+            raise InputError(f"{name} has shape {tuple(value.shape)}: must end in ({length},)")
+        if value.dtype != a.dtype or value.device != a.device:
+            raise InputError(f"{name} is {value.dtype} on {value.device}: must be {a.dtype} on {a.device}")
+        if not bool(torch.isfinite(value).all()):
+            raise InputError(f"{name} holds NaN or infinity")
+        return value
+
+    def _context(self, state: State, control: Tensor | None) -> StepContext:
+        return self.integrator.context(self.scene.articulation, state, self._dt, self.scene.gravity, control)
+
+    def step(self, state: State, control: Tensor | None = None) -> tuple[State, Solution]:
+        """One step of all worlds under `control` `[*batch, nu]` (None: zero). Never raises for one bad world: see the solution's
+        status. An unsolved world goes on from the best point found."""
+        advanced, solution, _ = self._step(state, control)
+        return advanced, solution
+
+    def _step(self, state: State, control: Tensor | None) -> tuple[State, Solution, BalanceObjective]:
+        with torch.no_grad():
+            context = self._context(state, control)
+            objective = BalanceObjective.of_step(self.scene.articulation, self.scene.terms, context, self._scale)
+            solution = self.solver.solve(objective, context.target_q, state.q)
+            return self.integrator.advance(state, solution.q), solution, objective
+
+    def rollout(
+        self,
+        state: State,
+        controls: Tensor | None = None,
+        steps: int | None = None,
+        progress: Callable[[int], object] | None = None,
+    ) -> Rollout:
+        """Steps from `state` and records everything.
+
+        controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step with the
+        number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
+        count = self._count(controls, steps)
+        recorder = Recorder(self.scene, self.integrator, self.dt, state)
+        try:
+            for k in range(count):
+                state, solution, objective = self._step(state, None if controls is None else controls[k])
+                recorder.record(state, solution, objective)
+                if progress is not None:
+                    progress(k + 1)
+        except KeyboardInterrupt:
+            if recorder.steps == 0:
+                raise
+        return recorder.finish()
+
+    def _count(self, controls: Tensor | None, steps: int | None) -> int:
+        if controls is None:
+            if steps is None or steps < 1:
+                raise InputError(f"steps is {steps}: must be ≥ 1 where there are no controls")
+            return steps
+        if controls.ndim < 2 or controls.shape[-1] != self.scene.nu:
+            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps, *batch, {self.scene.nu}]")
+        if steps is not None and steps != len(controls):
+            raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
+        return len(controls)

@@ -1,0 +1,146 @@
+"""Actuators at hinge and slide joints: torque, position (PD) and velocity servos, solved implicitly, with limits."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, JointKind
+from pbfd_torch.errors import InputError
+from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.load import JointLoad, StepContext
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """One actuator on a hinge or slide joint; x = gear · (joint coordinate).
+
+    Force before the gear: clamp(gain·u + bias − stiffness·x − damping·ẋ, force_range), u = clamp(control, control_range); the
+    joint feels gear times that. A motor has gain 1; a position servo gain = stiffness = kp; a velocity servo gain = damping = kv."""
+
+    name: str
+    joint: str
+    gear: float = 1.0
+    gain: float = 1.0
+    bias: float = 0.0
+    stiffness: float = 0.0
+    damping: float = 0.0
+    control_range: tuple[float, float] = (-math.inf, math.inf)
+    force_range: tuple[float, float] = (-math.inf, math.inf)
+
+    @staticmethod
+    def motor(name: str, joint: str, gear: float = 1.0, effort: float = math.inf) -> Actuator:
+        """Control is the force [N or N m] before the gear, within ±effort."""
+        return Actuator(name, joint, gear, force_range=(-effort, effort))
+
+    @staticmethod
+    def position(name: str, joint: str, kp: float, kv: float = 0.0, effort: float = math.inf) -> Actuator:
+        """Control is the wanted coordinate [rad or m]: kp (u − q) − kv q̇ within ±effort."""
+        return Actuator(name, joint, gain=kp, stiffness=kp, damping=kv, force_range=(-effort, effort))
+
+    @staticmethod
+    def velocity(name: str, joint: str, kv: float, effort: float = math.inf) -> Actuator:
+        """Control is the wanted velocity [rad/s or m/s]: kv (u − q̇) within ±effort."""
+        return Actuator(name, joint, gain=kv, damping=kv, force_range=(-effort, effort))
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedActuators:
+    drive: Tensor  # gain·u + bias
+    inverse_dt: Tensor
+    previous: Tensor  # x_n
+
+
+@dataclass(frozen=True, eq=False)
+class Actuators:
+    """All actuators of a robot as tensors `[*, nu]`; the control vector has their order. Build with `from_list`."""
+
+    names: tuple[str, ...]
+    coordinate: Tensor  # index into q
+    dof: Tensor  # index into v
+    gear: Tensor
+    gain: Tensor
+    bias: Tensor
+    stiffness: Tensor
+    damping: Tensor
+    control_range: Tensor  # [nu, 2]
+    force_range: Tensor  # [nu, 2]
+
+    @staticmethod
+    def from_list(articulation: Articulation, actuators: Sequence[Actuator]) -> Actuators:
+        """Raises `InputError` for an unknown joint, a joint that is no hinge or slide, or a negative stiffness or damping."""
+        t = articulation.topology
+        for a in actuators:
+            j = articulation.joint_index(a.joint)
+            if t.joint_sizes[j] != (JointKind.HINGE.nq, JointKind.HINGE.nv):
+                raise InputError(f"actuator '{a.name}': joint '{a.joint}' must be a hinge or a slide")
+            if a.stiffness < 0 or a.damping < 0:
+                raise InputError(f"actuator '{a.name}': stiffness {a.stiffness} and damping {a.damping} must be ≥ 0")
+        joints = [articulation.joint_index(a.joint) for a in actuators]
+
+        def tensor(values: Sequence[object]) -> Tensor:
+            return torch.tensor(values, dtype=articulation.dtype, device=articulation.device)
+
+        def index(starts: Sequence[int]) -> Tensor:
+            return torch.tensor([starts[j] for j in joints], dtype=torch.long, device=articulation.device)
+
+        return Actuators(
+            names=tuple(a.name for a in actuators),
+            coordinate=index(t.q_start),
+            dof=index(t.v_start),
+            gear=tensor([a.gear for a in actuators]),
+            gain=tensor([a.gain for a in actuators]),
+            bias=tensor([a.bias for a in actuators]),
+            stiffness=tensor([a.stiffness for a in actuators]),
+            damping=tensor([a.damping for a in actuators]),
+            control_range=tensor([a.control_range for a in actuators]).view(-1, 2),
+            force_range=tensor([a.force_range for a in actuators]).view(-1, 2),
+        )
+
+    @property
+    def nu(self) -> int:
+        """Length of the control vector."""
+        return len(self.names)
+
+    def to(self, dtype: torch.dtype, device: torch.device | str) -> Actuators:
+        """The same actuators in another dtype or on another device."""
+        moved = {
+            f.name: (v.to(device, dtype) if v.is_floating_point() else v.to(device))
+            for f in dataclasses.fields(self)
+            if isinstance(v := getattr(self, f.name), Tensor)
+        }
+        return dataclasses.replace(self, **moved)
+
+    def prepare(self, step: StepContext) -> PreparedActuators:
+        if step.control is None:
+            control = self.gain.new_zeros(self.nu)
+        elif step.control.shape[-1] != self.nu:
+            raise InputError(f"control has shape {tuple(step.control.shape)}: must end in ({self.nu},)")
+        else:
+            control = step.control
+        low, high = self.control_range.unbind(-1)
+        drive = self.gain * torch.maximum(torch.minimum(control, high), low) + self.bias
+        return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate])
+
+    def load(self, prepared: PreparedActuators, placement: Placement) -> JointLoad:
+        x = self.gear * placement.q[..., self.coordinate]
+        damping = self.damping * prepared.inverse_dt
+        force = prepared.drive - self.stiffness * x - damping * (x - prepared.previous)
+        low, high = self.force_range.unbind(-1)
+        inside = (force > low) & (force < high)
+        force = torch.maximum(torch.minimum(force, high), low)
+        slope = torch.where(inside, self.stiffness + damping, torch.zeros_like(force)) * self.gear * self.gear
+        spread = self._spread(placement)
+        residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
+        return JointLoad(residual, torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
+
+    def _spread(self, placement: Placement) -> Tensor:
+        """`[*batch, nu, nv]` 1 where the actuator drives the degree of freedom (several may drive one)."""
+        nv = placement.articulation.nv
+        spread = torch.nn.functional.one_hot(self.dof, nv).to(placement.q.dtype)
+        return spread.expand(*placement.q.shape[:-1], self.nu, nv)

@@ -1,0 +1,212 @@
+"""Contact of candidate points with a half-space: depth, slip, forces, and their exact stiffness.
+
+A candidate is a centre c fixed in a link, a radius ρ ≥ 0 and a margin δ ≥ 0. Its depth is d = ρ + δ − (n·c − h), its force
+acts at c − ρn, and its slip over the step is u = (I − nnᵀ)[(c − c_n) − ρ φ × n] with φ = log(R R_nᵀ): zero for pure rolling (METHOD §4).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.errors import InputError
+from pbfd_torch.kinematics import Placement
+from pbfd_torch.rotations import log_jacobian_left, quaternion_matrix, rotation_log, skew
+from pbfd_torch.terms.load import LinkLoad, StepContext
+from pbfd_torch.terms.normal_force import NormalForce
+
+
+class FrictionLaw(Protocol):
+    """Tangential force of a contact law."""
+
+    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Force, d force/d depth, d force/d slip from N, dN/dd, d `[*, n]`, u `[*, n, 3]` and dt (broadcastable to `[*, n]`)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedContact:
+    dt: Tensor  # [*batch, 1]
+    centers: Tensor  # [*batch, npoint, 3] at the start of the step
+    rotations: Tensor  # [*batch, nlink, 3, 3] at the start of the step
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """What the contacts of one placement look like, for records and pictures.
+
+    Attributes: `point` `[*, n, 3]` where the force acts [m]; `depth` `[*, n]` > 0 inside the obstacle [m]; `normal` `[*, 3]`;
+    `force` `[*, n, 3]` on the body [N]; `slip` `[*, n, 3]` over the step [m]."""
+
+    point: Tensor
+    depth: Tensor
+    normal: Tensor
+    force: Tensor
+    slip: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Candidate points against one half-space.
+
+    Attributes:
+        link: `[npoint]` index of the link that carries each candidate.
+        position: `[*, npoint, 3]` centre in the link's frame [m].
+        radius: `[npoint]` [m] ≥ 0.
+        margin: `[npoint]` [m] ≥ 0: skin in which the force sets in already.
+        normal: `[*, 3]` unit normal out of the obstacle; offset: `[*]` its height along the normal [m].
+        normal_force: Eq. 8.
+        friction: the tangential law, or None for a frictionless contact.
+        names: the collider that each candidate belongs to.
+    """
+
+    link: Tensor
+    position: Tensor
+    radius: Tensor
+    margin: Tensor
+    normal: Tensor
+    offset: Tensor
+    normal_force: NormalForce
+    friction: FrictionLaw | None
+    names: tuple[str, ...] = ()
+
+    @staticmethod
+    def between(
+        articulation: Articulation,
+        colliders: Sequence[Collider],
+        obstacle: HalfSpace,
+        normal_force: NormalForce,
+        friction: FrictionLaw | None,
+    ) -> Contact:
+        """All candidates of the colliders against the obstacle. Raises `InputError` for an unknown link or no candidate at all."""
+        links: list[int] = []
+        centers, radii, margins = [], [], []
+        names: list[str] = []
+        for collider in colliders:
+            points, radius = collider.shape.candidates()
+            turn = quaternion_matrix(torch.tensor(collider.quaternion, dtype=torch.float64)).numpy()
+            links += [articulation.link_index(collider.link)] * len(points)
+            centers.append(points @ turn.T + np.array(collider.position))
+            radii.append(radius)
+            margins.append(np.full(len(points), collider.margin))
+            names += [collider.name] * len(points)
+        if not links:
+            raise InputError(f"no collider can touch '{obstacle.name}': give at least one")
+
+        def tensor(values: Any) -> Tensor:
+            return torch.as_tensor(values, dtype=articulation.dtype, device=articulation.device)
+
+        return Contact(
+            link=torch.tensor(links, dtype=torch.long, device=articulation.device),
+            position=tensor(np.concatenate(centers)),
+            radius=tensor(np.concatenate(radii)),
+            margin=tensor(np.concatenate(margins)),
+            normal=tensor(obstacle.normal),
+            offset=tensor(obstacle.offset),
+            normal_force=normal_force,
+            friction=friction,
+            names=tuple(names),
+        )
+
+    @cached_property
+    def rounded(self) -> bool:
+        """Whether any candidate has a radius, so that rolling matters."""
+        return bool((self.radius > 0).any())
+
+    def _on_link(self, nlink: int) -> Tensor:
+        """`[nlink, npoint]` 1 where the candidate is the link's."""
+        return torch.nn.functional.one_hot(self.link, nlink).T.to(self.radius.dtype)
+
+    def _centers(self, placement: Placement) -> Tensor:
+        poses = placement.poses[..., self.link, :3, :]
+        return (poses[..., :3] @ self.position[..., None]).squeeze(-1) + poses[..., 3]
+
+    def prepare(self, step: StepContext) -> PreparedContact:
+        return PreparedContact(step.dt[..., None], self._centers(step.previous), step.previous.poses[..., :3, :3])
+
+    def _depth(self, centers: Tensor) -> Tensor:
+        return self.radius + self.margin + self.offset[..., None] - (centers @ self.normal[..., None]).squeeze(-1)
+
+    def _turn(self, prepared: PreparedContact, placement: Placement) -> Tensor:
+        """Rotation of each link over the step as a vector, `[*batch, nlink, 3]`."""
+        return rotation_log(placement.poses[..., :3, :3] @ prepared.rotations.mT)
+
+    def depth(self, placement: Placement) -> Tensor:
+        """Penetration depth of every candidate [m] `[*batch, npoint]`, < 0 where apart."""
+        return self._depth(self._centers(placement))
+
+    def _slip(self, prepared: PreparedContact, placement: Placement, centers: Tensor) -> Tensor:
+        normal = self.normal[..., None, :]
+        moved = centers - prepared.centers
+        if self.rounded:
+            turn = self._turn(prepared, placement)[..., self.link, :]
+            moved = moved - self.radius[..., None] * torch.linalg.cross(turn, normal.expand_as(turn))
+        return moved - (moved * normal).sum(-1, keepdim=True) * normal
+
+    def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
+        centers = self._centers(placement)
+        normal = self.normal[..., None, :].expand_as(centers)
+        depth = self._depth(centers)
+        push, push_slope = self.normal_force.force(depth)
+        force = push[..., None] * normal
+        by_depth = push_slope[..., None] * normal
+
+        # K: minus the derivative of the force by the link's twist (ω, v), [*batch, npoint, 3, 6]
+        lever = torch.linalg.cross(centers, normal)
+        approach = torch.cat((lever, normal), -1)[..., None, :]
+        if self.friction is None:
+            answer = by_depth[..., :, None] * approach
+        else:
+            slip = self._slip(prepared, placement, centers)
+            drag, drag_by_depth, drag_by_slip = self.friction.force(push, push_slope, depth, slip, prepared.dt)
+            force = force + drag
+            tangential = drag_by_slip - (drag_by_slip @ normal[..., None]) * normal[..., None, :]
+            arm = -skew(centers)
+            if self.rounded:
+                turning = skew(normal[..., :1, :]) @ log_jacobian_left(self._turn(prepared, placement))
+                arm = arm + self.radius[..., None, None] * turning[..., self.link, :, :]
+            answer = (by_depth + drag_by_depth)[..., :, None] * approach - torch.cat((tangential @ arm, tangential), -1)
+
+        points = centers - self.radius[..., None] * normal
+        stiffness = torch.cat((skew(points) @ answer, answer), -2)
+        if self.rounded:  # the point of application moves with the centre, not with the surface
+            pull = self.radius[..., None, None] * -(normal[..., :, None] * force[..., None, :])
+            trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+            eye = torch.eye(3, dtype=pull.dtype, device=pull.device)
+            stiffness = stiffness + torch.nn.functional.pad(pull - trace * eye, (0, 3, 0, 3))
+        moment = torch.cat((-force[..., :, None] * points[..., None, :], -force[..., :, None]), -1)
+
+        flat = torch.cat((moment.flatten(-2), stiffness.flatten(-2)), -1)
+        on_link = self._on_link(placement.poses.shape[-3])
+        total = on_link.expand(*flat.shape[:-2], *on_link.shape) @ flat
+        return LinkLoad(total[..., :12].unflatten(-1, (3, 4)), total[..., 12:].unflatten(-1, (6, 6)))
+
+    def potential(self, placement: Placement) -> Tensor:
+        """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
+        return self.normal_force.energy(self.depth(placement)).sum(-1)
+
+    def softened(self, factor: float) -> Contact:
+        """The same contact with C⊥ scaled by `factor`; the friction law follows the normal force."""
+        return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))
+
+    def points(self, prepared: PreparedContact, placement: Placement) -> ContactPoints:
+        """The contacts at a placement that ends the prepared step."""
+        centers = self._centers(placement)
+        depth = self._depth(centers)
+        push, push_slope = self.normal_force.force(depth)
+        force = push[..., None] * self.normal[..., None, :]
+        slip = self._slip(prepared, placement, centers)
+        if self.friction is not None:
+            force = force + self.friction.force(push, push_slope, depth, slip, prepared.dt)[0]
+        point = centers - self.radius[..., None] * self.normal[..., None, :]
+        return ContactPoints(point, depth, self.normal, force, slip)

@@ -1,0 +1,59 @@
+"""Coulomb friction with the real μ, fully implicit in the normal force."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+
+
+def slip_factor(size: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
+    """s and ds/dy of METHOD §4 at y = `size` ≥ 0: (2 − y/w)/w below `width` w, 1/y above; s·y rises smoothly from 0 to 1."""
+    inside = size < width
+    outer = torch.where(inside, torch.ones_like(size), size)
+    inverse = 1 / width
+    s = torch.where(inside, (2 - size * inverse) * inverse, 1 / outer)
+    slope = torch.where(inside, -inverse * inverse, -1 / (outer * outer))
+    return s, slope
+
+
+def isotropic_slope(slip: Tensor, size: Tensor, factor: Tensor, slope: Tensor) -> Tensor:
+    """d(factor(‖u‖) u)/du = factor·1 + (slope/‖u‖) u uᵀ `[*, 3, 3]`, with the second part zero at u = 0."""
+    safe = torch.where(size > 0, size, torch.ones_like(size))
+    eye = torch.eye(3, dtype=slip.dtype, device=slip.device)
+    outer = slip[..., :, None] * slip[..., None, :]
+    return factor[..., None, None] * eye + (slope / safe)[..., None, None] * outer
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombFriction:
+    """f∥ = −μ N s(‖u‖) u (METHOD §4): the dry friction law, smooth below the slip speed ε_v.
+
+    `mu`: coefficient ≥ 0, one number or one per candidate `[*, npoint]` (MuJoCo's rule for two surfaces: the larger one).
+    `slip_speed`: ε_v [m/s] > 0; under a tangential load W a sticking contact creeps at ε_v W/(2 μ N)."""
+
+    mu: float | Tensor
+    slip_speed: float = 1e-3
+
+    def __post_init__(self) -> None:
+        mu = torch.as_tensor(self.mu)
+        if not bool((torch.isfinite(mu) & (mu >= 0)).all()):
+            raise InputError(f"mu is {mu.tolist()}: must be finite and ≥ 0")
+        if not (math.isfinite(self.slip_speed) and self.slip_speed > 0):
+            raise InputError(f"slip_speed is {self.slip_speed} m/s: must be > 0 and finite")
+
+    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Friction force and its derivatives by depth and by slip: `[*, n, 3]`, `[*, n, 3]`, `[*, n, 3, 3]`.
+
+        normal, normal_slope, depth: N, dN/dd, d `[*, n]`; slip: u over the step `[*, n, 3]`; dt broadcastable to `[*, n]`."""
+        size = torch.linalg.vector_norm(slip, dim=-1)
+        factor, slope = slip_factor(size, self.slip_speed * dt)
+        unit = factor[..., None] * slip
+        force = -(self.mu * normal)[..., None] * unit
+        by_depth = -(self.mu * normal_slope)[..., None] * unit
+        by_slip = -(self.mu * normal)[..., None, None] * isotropic_slope(slip, size, factor, slope)
+        return force, by_depth, by_slip

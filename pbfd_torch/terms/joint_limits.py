@@ -1,0 +1,55 @@
+"""Joint limits: a stiff one-sided spring, continuously differentiable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, force_scale
+from pbfd_torch.errors import InputError
+from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Torque −k x² back towards the range, x the violation of `articulation.lower/upper`; energy k x³/3. `stiffness` `[*, nv]`
+    [N m/rad² or N/m²] > 0: a load τ rests √(τ/k) past the limit. Coordinates of ball and free joints have no limits."""
+
+    stiffness: Tensor
+
+    @staticmethod
+    def for_articulation(articulation: Articulation, gravity: float = 9.81, violation: float = 2e-3) -> JointLimits:
+        """Stiffness for which the whole weight (m g for a slide, m g · reach for a hinge) rests `violation` [rad or m] past a limit.
+        Reach: see `articulation.reach`. Raises `InputError` for a violation ≤ 0."""
+        if not (math.isfinite(violation) and violation > 0):
+            raise InputError(f"violation is {violation}: must be > 0 and finite")
+        return JointLimits(force_scale(articulation, gravity) / violation**2)
+
+    def prepare(self, step: StepContext) -> None:
+        return None
+
+    def load(self, prepared: None, placement: Placement) -> JointLoad:
+        below, above = _violations(placement)
+        residual = self.stiffness * (above * above - below * below)
+        return diagonal_load(residual, 2 * self.stiffness * (above + below))
+
+    def softened(self, factor: float) -> JointLimits:
+        """The same limits with stiffness scaled by `factor`."""
+        return JointLimits(self.stiffness * factor)
+
+    def potential(self, placement: Placement) -> Tensor:
+        """Stored energy [J] `[*batch]`."""
+        below, above = _violations(placement)
+        return (self.stiffness * (above**3 + below**3)).sum(-1) / 3
+
+
+def _violations(placement: Placement) -> tuple[Tensor, Tensor]:
+    """How far each coordinate is below its lower and above its upper limit, ≥ 0, `[*batch, nv]`."""
+    articulation = placement.articulation
+    t = articulation.topology
+    x = placement.q.new_zeros((*placement.q.shape[:-1], articulation.nv))
+    x[..., t.scalar_v] = placement.q[..., t.scalar_q]
+    return (articulation.lower - x).clamp_min(0), (x - articulation.upper).clamp_min(0)

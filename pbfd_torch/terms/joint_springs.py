@@ -1,0 +1,95 @@
+"""Effects that pull a joint towards a coordinate: springs, damping and armature share one quadratic energy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.errors import InputError
+from pbfd_torch.kinematics import Placement, difference
+from pbfd_torch.rotations import log_jacobian_symmetric
+from pbfd_torch.terms.load import JointLoad, StepContext
+
+
+def checked_coefficient(articulation: Articulation, value: Tensor, what: str, *, isotropic: bool = True) -> Tensor:
+    """`value` `[*, nv]` as the articulation's dtype; raises `InputError` unless it is finite, ≥ 0 and, where `isotropic`, the same
+    about all three axes of a ball or free joint's rotation."""
+    value = torch.as_tensor(value, dtype=articulation.dtype, device=articulation.device)
+    if value.ndim == 0 or value.shape[-1] != articulation.nv:
+        raise InputError(f"{what} has shape {tuple(value.shape)}: must end in ({articulation.nv},)")
+    if not bool((torch.isfinite(value) & (value >= 0)).all()):
+        raise InputError(f"{what} is {value.tolist()}: must be finite and ≥ 0")
+    turning = value[..., articulation.topology.turning_v]
+    if isotropic and not bool((turning == turning[..., :1]).all()):
+        raise InputError(f"{what} of a ball or free joint differs between its rotation axes: must be equal for all three")
+    return value
+
+
+def elastic_load(articulation: Articulation, coefficient: Tensor, rest: Tensor, q: Tensor) -> JointLoad:
+    """Gradient and Hessian of ½ Σ c_i e_i², e = difference(rest, q); rotation vectors keep their exact curvature."""
+    t = articulation.topology
+    gap = difference(articulation, rest, q)
+    residual = coefficient * gap
+    stiffness = torch.diag_embed(coefficient.expand_as(residual))
+    if len(t.turning_v):
+        rows, columns = t.turning_v[:, :, None], t.turning_v[:, None, :]
+        turning = gap[..., t.turning_v]
+        factor = coefficient[..., t.turning_v[:, :1]].unsqueeze(-1)
+        stiffness[..., rows, columns] = factor * log_jacobian_symmetric(turning)
+    return JointLoad(residual, stiffness)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedPull:
+    coefficient: Tensor
+    rest: Tensor
+
+
+class _Pull:
+    """Load and energy of an effect whose `prepare` gives a coefficient `[*batch, nv]` and a rest configuration."""
+
+    def load(self, prepared: PreparedPull, placement: Placement) -> JointLoad:
+        return elastic_load(placement.articulation, prepared.coefficient, prepared.rest, placement.q)
+
+    def energy(self, prepared: PreparedPull, placement: Placement) -> Tensor:
+        gap = difference(placement.articulation, prepared.rest, placement.q)
+        return 0.5 * (prepared.coefficient * gap * gap).sum(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class JointSprings(_Pull):
+    """Torque −k (q − rest). `stiffness` `[*, nv]` [N m/rad or N/m] ≥ 0, `rest` `[*, nq]`."""
+
+    stiffness: Tensor
+    rest: Tensor
+
+    def prepare(self, step: StepContext) -> PreparedPull:
+        return PreparedPull(self.stiffness, self.rest)
+
+    def potential(self, placement: Placement) -> Tensor:
+        """Stored energy [J] `[*batch]`."""
+        return self.energy(PreparedPull(self.stiffness, self.rest), placement)
+
+
+@dataclass(frozen=True, eq=False)
+class JointDamping(_Pull):
+    """Torque −c q̇ with q̇ = (q_{n+1} − q_n)/Δt, implicit. `damping` `[*, nv]` [N m s/rad or N s/m] ≥ 0."""
+
+    damping: Tensor
+
+    def prepare(self, step: StepContext) -> PreparedPull:
+        return PreparedPull(self.damping / step.dt[..., None], step.previous.q)
+
+
+@dataclass(frozen=True, eq=False)
+class Armature(_Pull):
+    """Inertia of the rotors behind the joints, as MuJoCo's: added to the diagonal of the mass matrix. `inertia` `[*, nv]`
+    [kg m² or kg] ≥ 0; pulled to the integrator's target configuration as links are to their target poses."""
+
+    inertia: Tensor
+
+    def prepare(self, step: StepContext) -> PreparedPull:
+        return PreparedPull(self.inertia * step.weight[..., None], step.target_q)

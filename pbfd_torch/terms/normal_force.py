@@ -1,0 +1,67 @@
+"""The normal force as a power of the penetration depth (Eq. 8)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+
+
+def power(base: Tensor, exponent: float) -> Tensor:
+    """base ** exponent for base ≥ 0 and exponent ≥ 0; whole exponents by products, so that a batch and a single world round alike."""
+    if exponent == int(exponent) and exponent <= 4:
+        result = torch.ones_like(base)
+        for _ in range(int(exponent)):
+            result = result * base
+        return result
+    positive = base > 0
+    safe = torch.where(positive, base, torch.ones_like(base))
+    return torch.where(positive, torch.exp(exponent * torch.log(safe)), torch.zeros_like(base))
+
+
+@dataclass(frozen=True, eq=False)
+class NormalForce:
+    """f⊥ = C⊥ d^α n (Eq. 8), energy C⊥ d^{α+1}/(α+1) (Eq. 9); at rest d = (N/C⊥)^{1/α}.
+
+    `stiffness`: C⊥ [N/m^α] > 0, one number or one per world `[*batch]` (or per candidate `[*batch, npoint]`).
+    `exponent`: α > 1, so that the residual is continuously differentiable (what GE needs)."""
+
+    stiffness: float | Tensor
+    exponent: float = 2.0
+
+    def __post_init__(self) -> None:
+        stiffness = torch.as_tensor(self.stiffness)
+        if not bool((torch.isfinite(stiffness) & (stiffness > 0)).all()):
+            raise InputError(f"stiffness is {stiffness.tolist()} N/m^α: must be finite and > 0")
+        if not (math.isfinite(self.exponent) and self.exponent > 1):
+            raise InputError(f"exponent α is {self.exponent}: must be > 1 and finite, or the residual is not smooth")
+
+    @staticmethod
+    def for_weight(weight: float, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:
+        """The stiffness at which a load `weight` [N] on one point rests `penetration` [m] deep."""
+        if not (math.isfinite(weight) and weight > 0 and math.isfinite(penetration) and penetration > 0):
+            raise InputError(f"weight is {weight} N and penetration {penetration} m: must be > 0 and finite")
+        return NormalForce(weight / penetration**exponent, exponent)
+
+    def _coefficient(self, depth: Tensor) -> float | Tensor:
+        if isinstance(self.stiffness, Tensor) and 0 < self.stiffness.ndim < depth.ndim:
+            return self.stiffness[..., None]
+        return self.stiffness
+
+    def scaled(self, factor: float) -> NormalForce:
+        """The same law with C⊥ scaled by `factor` > 0."""
+        return NormalForce(self.stiffness * factor, self.exponent)
+
+    def force(self, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """N and dN/dd `[*batch, npoint]` at depth d (≤ 0: apart, no force)."""
+        d = depth.clamp_min(0)
+        c = self._coefficient(depth)
+        return c * power(d, self.exponent), c * self.exponent * power(d, self.exponent - 1)
+
+    def energy(self, depth: Tensor) -> Tensor:
+        """C⊥ d^{α+1}/(α+1) [J] per candidate."""
+        return self._coefficient(depth) * power(depth.clamp_min(0), self.exponent + 1) / (self.exponent + 1)

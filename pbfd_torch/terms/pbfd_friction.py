@@ -1,0 +1,66 @@
+"""The paper's friction: a viscous force weighted by the depth (Eq. 12), without the spurious normal part of its energy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.terms.coulomb_friction import isotropic_slope
+from pbfd_torch.terms.normal_force import power
+
+
+@dataclass(frozen=True, eq=False)
+class PbfdFriction:
+    """f∥ = −C∥ (β + 1) ‖u‖^e u d^{γ+1}, u the slip over the step.
+
+    Eq. 12 prints e = β; the gradient of the energy that it comes from (Eq. 11) has e = β − 1. Both exist: `as_printed` and
+    `as_derived`; with β = 1 the first is quadratic in the slip, the second linear.
+
+    `stiffness`: C∥ ≥ 0, a number or `[*batch, npoint]`; `beta`, `gamma` > 0; `slip_exponent`: e ≥ 0."""
+
+    stiffness: float | Tensor
+    beta: float
+    gamma: float
+    slip_exponent: float
+
+    def __post_init__(self) -> None:
+        stiffness = torch.as_tensor(self.stiffness)
+        if not bool((torch.isfinite(stiffness) & (stiffness >= 0)).all()):
+            raise InputError(f"C∥ is {stiffness.tolist()}: must be finite and ≥ 0")
+        if not (self.beta > 0 and self.gamma > 0 and math.isfinite(self.beta + self.gamma)):
+            raise InputError(f"β is {self.beta} and γ is {self.gamma}: must be > 0 and finite")
+        if not (math.isfinite(self.slip_exponent) and self.slip_exponent >= 0):
+            raise InputError(f"slip exponent is {self.slip_exponent}: must be ≥ 0 and finite")
+
+    @staticmethod
+    def as_printed(stiffness: float | Tensor, beta: float = 1.0, gamma: float = 1.0) -> PbfdFriction:
+        """Eq. 12 with ‖u‖^β, as the paper prints it."""
+        return PbfdFriction(stiffness, beta, gamma, beta)
+
+    @staticmethod
+    def as_derived(stiffness: float | Tensor, beta: float = 1.0, gamma: float = 1.0) -> PbfdFriction:
+        """Eq. 12 with ‖u‖^{β−1}, as the gradient of Eq. 11 gives it; needs β ≥ 1 to be smooth at rest."""
+        if beta < 1:
+            raise InputError(f"β is {beta}: the derived law needs β ≥ 1 to stay finite at zero slip")
+        return PbfdFriction(stiffness, beta, gamma, beta - 1)
+
+    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Friction force and its derivatives by depth and by slip, shapes as in `CoulombFriction.force`."""
+        d = depth.clamp_min(0)
+        size = torch.linalg.vector_norm(slip, dim=-1)
+        factor = power(size, self.slip_exponent)
+        if self.slip_exponent > 0:  # slope/‖u‖ · u uᵀ vanishes at u = 0, where isotropic_slope guards the division
+            safe = torch.where(size > 0, size, torch.ones_like(size))
+            slope = self.slip_exponent * factor / safe
+        else:
+            slope = torch.zeros_like(size)
+        scale = self.stiffness * (self.beta + 1)
+        weight = scale * power(d, self.gamma + 1)
+        weight_slope = scale * (self.gamma + 1) * power(d, self.gamma)
+        unit = factor[..., None] * slip
+        by_slip = -weight[..., None, None] * isotropic_slope(slip, size, factor, slope)
+        return -weight[..., None] * unit, -weight_slope[..., None] * unit, by_slip
