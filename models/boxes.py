@@ -29,17 +29,13 @@ SLIDING_FRICTION = (0.1, 0.2, 0.3, 0.5, 0.8)
 def _box_link(name: str) -> Link:
     """1 kg, 0.2 × 0.2 × 0.1 m, free to move."""
     x, y, z = (2 * h for h in HALF)
-    inertia = ((y * y + z * z) / 12, (x * x + z * z) / 12, (x * x + y * y) / 12)
-    rows = tuple(tuple(inertia[i] if i == j else 0.0 for j in range(3)) for i in range(3))
+    rows = (((y * y + z * z) / 12, 0.0, 0.0), (0.0, (x * x + z * z) / 12, 0.0), (0.0, 0.0, (x * x + y * y) / 12))
     return Link(name, joints=(Joint(f"{name}_free", JointKind.FREE),), mass=1.0, inertia=rows)
 
 
 def _corners(name: str) -> list[Collider]:
-    signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    return [
-        Collider(f"{name}_{k}", name, Sphere(RADIUS), tuple(s * h for s, h in zip(sign, HALF, strict=True)))
-        for k, sign in enumerate(signs)
-    ]
+    places = [(x, y, z) for x in (-HALF[0], HALF[0]) for y in (-HALF[1], HALF[1]) for z in (-HALF[2], HALF[2])]
+    return [Collider(f"{name}_{k}", name, Sphere(RADIUS), place) for k, place in enumerate(places)]
 
 
 def _scene(names: list[str], mu: Tensor, slope: float, title: str, dtype: torch.dtype, device: torch.device) -> Scene:
@@ -68,7 +64,7 @@ def box_slide(worlds: int = 5, dtype: torch.dtype = torch.float64, device: torch
     v[:, 0] = 1.0
     exact = (1.0 / (2 * mu * GRAVITY)).tolist()
 
-    def metrics(rollout: Rollout) -> Mapping[str, Metric]:
+    def report(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
         distance = (rollout.q[-1, :, 0] - rollout.q[0, :, 0]).tolist()
         speed = torch.linalg.vector_norm(rollout.v[-1, :, :3], dim=-1).tolist()
         return {
@@ -79,7 +75,7 @@ def box_slide(worlds: int = 5, dtype: torch.dtype = torch.float64, device: torch
             "final_speed_m_s": speed,
         }
 
-    return Setup(scene, q, v, 1.5, 0.02, metrics)
+    return Setup(scene, q, v, 1.5, 0.02, report)
 
 
 def box_slope(worlds: int = 2, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
@@ -90,7 +86,7 @@ def box_slope(worlds: int = 2, dtype: torch.dtype = torch.float64, device: torch
     q = repeated(scene.articulation.rest, worlds)
     q[:, 2] = _resting_height(slope)
 
-    def metrics(rollout: Rollout) -> Mapping[str, Metric]:
+    def report(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
         moved = (rollout.q[-1, :, 0] - rollout.q[0, :, 0]).tolist()
         duration = float(rollout.time[-1])
         acceleration = [max(0.0, GRAVITY * (math.sin(slope) - m * math.cos(slope))) for m in mu.tolist()]
@@ -103,7 +99,7 @@ def box_slope(worlds: int = 2, dtype: torch.dtype = torch.float64, device: torch
             "slide_distance_error_m": [d - e for d, e in zip(moved, exact, strict=True)],
         }
 
-    return Setup(scene, q, q.new_zeros(worlds, 6), 5.0, 0.02, metrics)
+    return Setup(scene, q, q.new_zeros(worlds, 6), 5.0, 0.02, report)
 
 
 def stack(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
@@ -115,9 +111,9 @@ def stack(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.dev
         q[:, 7 * k] = 0.3 * k
         q[:, 7 * k + 2] = _resting_height(0.0)
 
-    def metrics(rollout: Rollout) -> Mapping[str, Metric]:
+    def report(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
         moved = rollout.link_poses[-1, ..., 3] - rollout.link_poses[0, ..., 3]
         return {"largest_move_m": torch.linalg.vector_norm(moved, dim=-1).amax(-1).tolist()}
 
     note = "boxes rest on the ground only: contact between bodies is not modelled in this version"
-    return Setup(scene, q, q.new_zeros(worlds, 30), 10.0, 0.02, metrics, (note,))
+    return Setup(scene, q, q.new_zeros(worlds, 30), 10.0, 0.02, report, (note,))

@@ -21,7 +21,7 @@ class Setup:
     q, v: start `[worlds, nq]`, `[worlds, nv]`.
     duration: [s] that the scene is meant to run.
     dt: step [s] that suits it.
-    metrics: rollout → named numbers, a list having one entry per world.
+    report: (setup, rollout) → named numbers, a list having one entry per world; see `metrics`.
     notes: what a reader of the result should know.
     """
 
@@ -30,8 +30,12 @@ class Setup:
     v: Tensor
     duration: float
     dt: float
-    metrics: Callable[[Rollout], Mapping[str, Metric]] = field(default=lambda rollout: {})
+    report: Callable[[Setup, Rollout], Mapping[str, Metric]] = field(default=lambda setup, rollout: {})
     notes: Sequence[str] = ()
+
+    def metrics(self, rollout: Rollout) -> dict[str, Metric]:
+        """The scene's own numbers for a rollout from this setup."""
+        return dict(self.report(self, rollout))
 
     @property
     def worlds(self) -> int:

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy, rotor_energy
+from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
 from pbfd_torch.kinematics import place
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.load import Conservative
 
 if TYPE_CHECKING:
     from pbfd_torch.simulator import Scene
@@ -41,17 +40,13 @@ class Recorder:
         placement = place(a, state.q)
         rates = self._integrator.pose_rates(a, state, dt)
         linear, angular = momentum(placement, rates)
-        potential = potential_energy(placement, scene.gravity)
-        for term in scene.terms:
-            if isinstance(term, Conservative):
-                potential = potential + term.potential(placement)
         self._add(
             q=state.q,
             v=v,
             link_poses=placement.poses[..., :3, :],
             center_of_mass=center_of_mass(placement),
             kinetic_energy=kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
-            potential_energy=potential,
+            potential_energy=scene.potential_energy(placement),
             linear_momentum=linear,
             angular_momentum=angular,
         )

@@ -9,6 +9,7 @@ import tempfile
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -104,15 +105,15 @@ class Rollout:
                 meta = json.loads(str(file["meta"]))
                 if meta.get("format") != FORMAT:
                     raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
-                arrays = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
+                arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
         except FileNotFoundError as error:
             raise InputError(f"no rollout at '{path}'") from error
         except (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"'{path}' is not a readable rollout: {error}") from error
-        names = {key: tuple(meta[key]) for key in ("link_names", "joint_names")}
-        return Rollout(scene_name=meta["scene_name"], dt=float(meta["dt"]), **names, **arrays)
+        texts: dict[str, Any] = {key: tuple(meta[key]) for key in ("link_names", "joint_names")}
+        return Rollout(scene_name=meta["scene_name"], dt=float(meta["dt"]), **texts, **arrays)
 
 
 _ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]

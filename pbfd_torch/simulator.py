@@ -13,16 +13,17 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation, force_scale
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider
-from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.kinematics import Placement, place, pose_rates
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.continuation import Continuation
 from pbfd_torch.solvers.objective import Objective, Solution
 from pbfd_torch.terms.actuators import Actuators
-from pbfd_torch.terms.load import StepContext, Term
+from pbfd_torch.terms.load import Conservative, StepContext, Term
 
 
 class Solver(Protocol):
@@ -66,6 +67,24 @@ class Scene:
                     element=f"joint '{a.joint_names[joint]}'",
                 )
 
+    def potential_energy(self, placement: Placement) -> Tensor:
+        """Stored energy [J] `[*batch]`: gravity, springs, limits and the contacts' normal forces."""
+        total = potential_energy(placement, self.gravity)
+        for term in self.terms:
+            if isinstance(term, Conservative):
+                total = total + term.potential(placement)
+        return total
+
+    def energy(self, q: Tensor, v: Tensor) -> Tensor:
+        """Kinetic plus stored energy [J] `[*batch]` at q `[*batch, nq]` and velocity v `[*batch, nv]`."""
+        placement = place(self.articulation, q)
+        rates, _ = pose_rates(placement, v)
+        return (
+            kinetic_energy(self.articulation, rates)
+            + rotor_energy(self.articulation, v, self.terms)
+            + self.potential_energy(placement)
+        )
+
     @property
     def nu(self) -> int:
         """Length of the control vector."""
@@ -76,7 +95,7 @@ class Simulator:
     """Steps a scene. `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions' differences."""
 
     def __init__(self, scene: Scene, dt: float, integrator: ImplicitEuler | None = None, solver: Solver | None = None) -> None:
-        if not (isinstance(dt, (int, float)) and math.isfinite(dt) and dt >= 1e-5):
+        if not (math.isfinite(dt) and dt >= 1e-5):
             raise InputError(f"dt is {dt} s: must be a finite number ≥ 1e-5")
         a = scene.articulation
         self.scene = scene

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -109,7 +110,7 @@ class Actuators:
 
     def to(self, dtype: torch.dtype, device: torch.device | str) -> Actuators:
         """The same actuators in another dtype or on another device."""
-        moved = {
+        moved: dict[str, Any] = {
             f.name: (v.to(device, dtype) if v.is_floating_point() else v.to(device))
             for f in dataclasses.fields(self)
             if isinstance(v := getattr(self, f.name), Tensor)

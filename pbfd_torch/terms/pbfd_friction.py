@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,6 +47,12 @@ class PbfdFriction:
         if beta < 1:
             raise InputError(f"β is {beta}: the derived law needs β ≥ 1 to stay finite at zero slip")
         return PbfdFriction(stiffness, beta, gamma, beta - 1)
+
+    def calibrated(self, mu: float | Tensor, normal_stiffness: float | Tensor, speed: float, dt: float) -> PbfdFriction:
+        """The same law with the C∥ at which a contact sliding at `speed` [m/s] feels μ: with α = 2 and γ = 1 friction is proportional to
+        the normal force, μ = (β + 1) (C∥/C⊥) (v Δt)^{e + 1} (METHOD §4). It holds at this speed and Δt only."""
+        share = (self.beta + 1) * (speed * dt) ** (self.slip_exponent + 1)
+        return replace(self, stiffness=mu * normal_stiffness / share)
 
     def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Friction force and its derivatives by depth and by slip, shapes as in `CoulombFriction.force`."""

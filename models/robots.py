@@ -1,0 +1,49 @@
+"""Scenes made from robot files: our own hopper and walker, and any URDF or MJCF file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from pbfd_torch.loading import Robot, load_robot
+from pbfd_torch.loading.scene import ground_below, robot_scene
+from pbfd_torch.models.setup import Setup, repeated
+
+_HERE = Path(__file__).parent
+
+
+def robot_setup(robot: Robot, worlds: int = 1, duration: float = 2.0) -> Setup:
+    """The robot at its rest configuration, without control. A robot that can fall and whose file knows no ground gets a level one just
+    below it."""
+    free = any(size == (7, 6) for size in robot.articulation.topology.joint_sizes)
+    notes = list(robot.not_modelled)
+    obstacles = robot.obstacles
+    if free and not obstacles and robot.colliders and any(robot.gravity):
+        obstacles = (ground_below(robot),)
+        notes.append(f"the file has no ground: a level one was added at z = {obstacles[0].offset:.4g} m")
+    scene = robot_scene(robot, obstacles)
+    q = repeated(robot.articulation.rest, worlds)
+    return Setup(scene, q, q.new_zeros(worlds, robot.articulation.nv), duration, 0.008, notes=notes)
+
+
+def file_setup(
+    path: str | os.PathLike[str],
+    worlds: int = 1,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+    free_base: bool | None = None,
+) -> Setup:
+    """Setup of a URDF or MJCF file; raises `ModelError` as `load_robot` does."""
+    return robot_setup(load_robot(path, free_base=free_base, dtype=dtype, device=device), worlds)
+
+
+def hopper(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
+    """A planar one-legged hopper, dropped onto its foot and left to itself."""
+    return file_setup(_HERE / "hopper.xml", worlds, dtype, device)
+
+
+def walker(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
+    """A planar two-legged walker, dropped onto its feet and left to itself."""
+    return file_setup(_HERE / "walker.xml", worlds, dtype, device)

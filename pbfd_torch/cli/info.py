@@ -1,0 +1,111 @@
+"""`pbfd info`: what is in a robot file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.loading import Robot, load_robot
+from pbfd_torch.models import SCENES
+from pbfd_torch.terms.joint_springs import Armature, JointDamping
+
+
+def run(file: str, free_base: bool | None, as_json: bool) -> None:
+    """Prints the contents of a file, or the file behind a named scene."""
+    if file in SCENES:
+        shipped = Path(__file__).parent.parent / "models" / f"{file}.xml"
+        if not shipped.exists():
+            raise InputError(f"'{file}' is a scene made in code: give a URDF or MJCF file")
+        file = str(shipped)
+    robot = load_robot(file, free_base=free_base)
+    contents = describe(robot)
+    if as_json:
+        print(json.dumps(contents))
+    else:
+        _print(contents)
+
+
+def describe(robot: Robot) -> dict[str, Any]:
+    """Everything that `pbfd info` says, as plain data."""
+    a = robot.articulation
+    t = a.topology
+    kinds = {(7, 6): "free", (4, 3): "ball"}
+    joints = [
+        {
+            "name": name,
+            "kind": kinds.get(t.joint_sizes[j], "hinge" if t.joint_is_hinge[j] else "slide"),
+            "link": a.link_names[t.joint_link[j]],
+            "range": [_finite(a.lower[t.v_start[j]]), _finite(a.upper[t.v_start[j]])],
+            "armature": _coefficient(robot, Armature, "inertia", t.v_start[j]),
+            "damping": _coefficient(robot, JointDamping, "damping", t.v_start[j]),
+        }
+        for j, name in enumerate(a.joint_names)
+    ]
+    links = [
+        {
+            "name": name,
+            "parent": a.link_names[t.link_parent[k]] if t.link_parent[k] >= 0 else "",
+            "mass_kg": float(a.mass[k]),
+            "shapes": [type(c.shape).__name__ for c in robot.colliders if c.link == name],
+        }
+        for k, name in enumerate(a.link_names)
+    ]
+    return {
+        "name": robot.name,
+        "nq": a.nq,
+        "nv": a.nv,
+        "nu": robot.actuators.nu if robot.actuators else 0,
+        "mass_kg": float(a.mass.sum()),
+        "gravity_m_s2": list(robot.gravity),
+        "links": links,
+        "joints": joints,
+        "actuators": list(robot.actuators.names) if robot.actuators else [],
+        "obstacles": [{"name": o.name, "normal": list(o.normal), "offset_m": o.offset} for o in robot.obstacles],
+        "keyframes": list(robot.keyframes),
+        "terms": [type(term).__name__ for term in robot.joint_terms],
+        "not_modelled": list(robot.not_modelled),
+    }
+
+
+def _finite(value: torch.Tensor) -> float | None:
+    return float(value) if bool(torch.isfinite(value)) else None
+
+
+def _coefficient(robot: Robot, kind: type, field: str, dof: int) -> float:
+    return sum(float(getattr(term, field)[dof]) for term in robot.joint_terms if isinstance(term, kind))
+
+
+def _print(contents: dict[str, Any]) -> None:
+    console = Console()
+    console.print(
+        f"{contents['name']}: {len(contents['links'])} links, {contents['nv']} degrees of freedom, {contents['nu']} actuators, "
+        f"{contents['mass_kg']:.6g} kg, gravity {contents['gravity_m_s2']}",
+        markup=False,
+    )
+    links = Table("link", "parent", "mass [kg]", "shapes", title="links", title_justify="left")
+    for x in contents["links"]:
+        links.add_row(x["name"], x["parent"] or "world", f"{x['mass_kg']:.6g}", ", ".join(x["shapes"]))
+    joints = Table("joint", "kind", "link", "range", "armature", "damping", title="joints", title_justify="left")
+    for x in contents["joints"]:
+        low, high = x["range"]
+        limits = (
+            ""
+            if low is None and high is None
+            else f"{-float('inf') if low is None else low:.4g} … {float('inf') if high is None else high:.4g}"
+        )
+        joints.add_row(x["name"], x["kind"], x["link"], limits, f"{x['armature']:.4g}", f"{x['damping']:.4g}")
+    console.print(links, joints)
+    for key in ("actuators", "keyframes", "terms"):
+        console.print(f"{key}: {', '.join(contents[key]) or 'none'}", markup=False)
+    for obstacle in contents["obstacles"]:
+        console.print(
+            f"obstacle: {obstacle['name']}, half-space with normal {obstacle['normal']} at {obstacle['offset_m']:.4g} m",
+            markup=False,
+        )
+    console.print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"), markup=False)

@@ -1,0 +1,111 @@
+"""The command's choices, and the setup they lead to."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.models import SCENES, Setup, file_setup
+from pbfd_torch.simulator import Solver
+from pbfd_torch.solvers.continuation import Continuation
+from pbfd_torch.solvers.jtj_lm import JtjLm
+from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.pbfd_friction import PbfdFriction
+
+CALIBRATION_SPEED = 1.0  # [m/s] at which the PBFD law's C∥ gives the scene's μ
+
+
+class Integrator(str, enum.Enum):
+    IMPLICIT_EULER = "implicit-euler"
+
+
+class SolverChoice(str, enum.Enum):
+    CONTINUATION = "jtj-lm-continuation"
+    JTJ_LM = "jtj-lm"
+
+
+class Friction(str, enum.Enum):
+    COULOMB = "coulomb"
+    PBFD_PRINTED = "pbfd"
+    PBFD_DERIVED = "pbfd-derived"
+    NONE = "none"
+
+
+class Dtype(str, enum.Enum):
+    FLOAT64 = "float64"
+    FLOAT32 = "float32"
+
+    @property
+    def torch(self) -> torch.dtype:
+        return torch.float64 if self is Dtype.FLOAT64 else torch.float32
+
+
+class Device(str, enum.Enum):
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the user chose, besides the scene, its length and where the result goes."""
+
+    integrator: Integrator = Integrator.IMPLICIT_EULER
+    solver: SolverChoice = SolverChoice.CONTINUATION
+    friction: Friction | None = None
+    dtype: Dtype = Dtype.FLOAT64
+    device: Device = Device.CPU
+    seed: int | None = None
+    free_base: bool | None = None
+
+    def make_solver(self) -> Solver:
+        return Continuation() if self.solver is SolverChoice.CONTINUATION else JtjLm()
+
+
+def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
+    """The named scene or the file, in the wanted number of worlds, on the wanted device. Raises `InputError` or `ModelError`."""
+    if worlds is not None and worlds < 1:
+        raise InputError(f"--worlds is {worlds}: must be ≥ 1")
+    if choices.device is Device.CUDA and not torch.cuda.is_available():
+        raise InputError("--device is cuda, but PyTorch finds no CUDA device: choose cpu")
+    if scene in SCENES:
+        if choices.free_base is not None:
+            raise InputError("--fixed-base and --free-base are for URDF files only")
+        count = {} if worlds is None else {"worlds": worlds}
+        setup = SCENES[scene](**count, dtype=choices.dtype.torch, device=choices.device.value)
+    elif Path(scene).suffix or Path(scene).exists():
+        setup = file_setup(scene, worlds or 1, choices.dtype.torch, choices.device.value, choices.free_base)
+    else:
+        raise InputError(f"'{scene}' is no file and no named scene: the scenes are {', '.join(SCENES)}")
+    return setup if choices.seed is None else _shaken(setup, choices.seed)
+
+
+def _shaken(setup: Setup, seed: int) -> Setup:
+    """All worlds but the first start with random extra velocities, normal with 0.05 m/s and rad/s."""
+    generator = torch.Generator().manual_seed(seed)
+    extra = 0.05 * torch.randn(setup.v.shape, generator=generator, dtype=torch.float64)
+    extra[0] = 0
+    return dataclasses.replace(setup, v=setup.v + extra.to(setup.v.device, setup.v.dtype))
+
+
+def with_friction(setup: Setup, choice: Friction | None, dt: float) -> Setup:
+    """The setup with another friction law in all its contacts; the PBFD laws are calibrated to its μ at 1 m/s and this Δt."""
+    if choice is None or choice is Friction.COULOMB:
+        return setup
+    terms = [
+        dataclasses.replace(term, friction=_law(choice, term, dt)) if isinstance(term, Contact) else term
+        for term in setup.scene.terms
+    ]
+    return dataclasses.replace(setup, scene=dataclasses.replace(setup.scene, terms=tuple(terms)))
+
+
+def _law(choice: Friction, contact: Contact, dt: float) -> FrictionLaw | None:
+    if choice is Friction.NONE or not isinstance(contact.friction, CoulombFriction):
+        return None
+    base = PbfdFriction.as_printed(0.0) if choice is Friction.PBFD_PRINTED else PbfdFriction.as_derived(0.0)
+    return base.calibrated(contact.friction.mu, contact.normal_force.stiffness, CALIBRATION_SPEED, dt)

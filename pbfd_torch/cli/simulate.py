@@ -1,0 +1,151 @@
+"""`pbfd simulate`: runs a setup, reports it, saves it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from pbfd_torch.cli.options import Choices, with_friction
+from pbfd_torch.errors import InputError
+from pbfd_torch.models import Setup
+from pbfd_torch.rollout import Rollout
+from pbfd_torch.simulator import Simulator
+from pbfd_torch.solvers.objective import Status
+
+MAX_STEPS = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A rollout with what was asked for and how long it took."""
+
+    setup: Setup
+    rollout: Rollout
+    choices: Choices
+    wall_s: float
+
+    def summary(self) -> dict[str, Any]:
+        """The numbers of the report; energies and the centre of mass are world 0's, extremes are over all worlds."""
+        r = self.rollout
+        duration = r.steps * r.dt
+        start = self.setup.scene.energy(self.setup.q, self.setup.v)
+        iterations = r.iterations.to(torch.float64).flatten()
+        metrics = self.setup.metrics(r)
+        return {
+            "scene": self.setup.scene.name,
+            "worlds": self.setup.worlds,
+            "dt": r.dt,
+            "duration": duration,
+            "steps": r.steps,
+            "integrator": self.choices.integrator.value,
+            "solver": self.choices.solver.value,
+            "dtype": self.choices.dtype.value,
+            "device": self.choices.device.value,
+            "wall_s": self.wall_s,
+            "ms_per_simulated_s_per_world": 1e3 * self.wall_s / duration / self.setup.worlds,
+            "solved_fraction": float(r.solved.to(torch.float64).mean()),
+            "unsolved_steps": int((~r.solved).sum()),
+            "continued_steps": int((r.status == int(Status.CONTINUED)).sum()),
+            "iterations_mean": float(iterations.mean()),
+            "iterations_p95": float(iterations.sort().values[math.ceil(0.95 * len(iterations)) - 1]),
+            "iterations_max": int(iterations.max()),
+            "evaluations_mean": float(r.evaluations.to(torch.float64).mean()),
+            "max_penetration_m": float(r.penetration.max()),
+            "energy_start_J": float(start[0]),
+            "energy_end_J": float(r.energy[-1, 0]),
+            "energy_max_gain_J": max(0.0, float((r.energy[1:] - start).max())),
+            "final_com_m": r.center_of_mass[-1, 0].tolist(),
+            "metrics": metrics,
+            "notes": list(self.setup.notes),
+        }
+
+
+def run(setup: Setup, choices: Choices, duration: float | None, dt: float | None, out: Path | None, as_json: bool) -> int:
+    """Runs and reports; the exit status: 0, or 1 where some world has an unsolved step."""
+    if out is not None:
+        check_writable(out)
+    result = simulated(setup, choices, duration, dt)
+    if out is not None:
+        result.rollout.save(out)
+    if as_json:
+        print(json.dumps(result.summary()))
+    else:
+        print_summary(result, out)
+    return 0 if bool(result.rollout.solved.all()) else 1
+
+
+def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt: float | None = None) -> Result:
+    """Runs a setup with a progress bar on a terminal. Interrupted, it keeps the steps done."""
+    duration = setup.duration if duration is None else duration
+    dt = setup.dt if dt is None else dt
+    if not (math.isfinite(duration) and duration > 0):
+        raise InputError(f"--duration is {duration} s: must be > 0 and finite")
+    if not (math.isfinite(dt) and 0 < dt <= duration):
+        raise InputError(f"--dt is {dt} s: must be > 0 and at most the duration, {duration} s")
+    steps = round(duration / dt)
+    if steps > MAX_STEPS:
+        raise InputError(f"--duration {duration} s at --dt {dt} s makes {steps} steps: must be at most {MAX_STEPS}")
+    setup = with_friction(setup, choices.friction, dt)
+    simulator = Simulator(setup.scene, dt, solver=choices.make_solver())
+    started = time.perf_counter()
+    with tqdm(total=steps, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
+        rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), steps=steps, progress=lambda done: bar.update())
+    wall = time.perf_counter() - started
+    if rollout.steps < steps:
+        print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)
+    return Result(setup, rollout, choices, wall)
+
+
+def check_writable(path: Path) -> None:
+    """Raises `InputError` now rather than after the simulation."""
+    if path.suffix != ".npz":
+        raise InputError(f"--out is '{path}': must end in .npz")
+    folder = path.parent
+    while not folder.exists():
+        folder = folder.parent
+    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"--out is '{path}': cannot be written there")
+
+
+def print_summary(result: Result, out: Path | None) -> None:
+    """The report as a table."""
+    summary = result.summary()
+    metrics, notes = summary.pop("metrics"), summary.pop("notes")
+    table = Table(title=f"pbfd simulate {summary.pop('scene')}", show_header=False, title_justify="left")
+    table.add_column(style="cyan")
+    table.add_column()
+    for key, value in (summary | metrics).items():
+        table.add_row(key, _text(value))
+    console = Console()
+    console.print(table)
+    for note in notes:
+        console.print(f"note: {note}", markup=False)
+    if not bool(result.rollout.solved.all()):
+        bad = int((~result.rollout.solved).any(0).sum())
+        console.print(
+            f"{bad} of {summary['worlds']} worlds have unsolved steps: their motion after those is not to be trusted", style="red"
+        )
+    if out is not None:
+        console.print(f"rollout written to {out}", markup=False)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        if len(value) > 8 and all(isinstance(x, float) for x in value):
+            middle = sorted(value)[len(value) // 2]
+            return f"min {min(value):.4g}, median {middle:.4g}, max {max(value):.4g}"
+        return ", ".join(_text(x) for x in value)
+    return str(value)
