@@ -15,8 +15,8 @@ _HERE = Path(__file__).parent
 
 
 def robot_setup(robot: Robot, worlds: int = 1, duration: float = 2.0) -> Setup:
-    """The robot at its rest configuration, without control. A robot that can fall and whose file knows no ground gets a level one just
-    below it."""
+    """The robot at its rest configuration, without control. A robot that can fall and whose file knows no ground gets a level
+    one just below it."""
     free = any(size == (7, 6) for size in robot.articulation.topology.joint_sizes)
     notes = list(robot.not_modelled)
     obstacles = robot.obstacles

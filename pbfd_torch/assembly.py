@@ -36,10 +36,9 @@ def subtree_sums(placement: Placement, loads: Sequence[LinkLoad]) -> tuple[Tenso
     moment, stiffness = loads[0].moment, loads[0].stiffness
     for load in loads[1:]:
         moment, stiffness = moment + load.moment, stiffness + load.stiffness
-    flat = torch.cat((moment.flatten(-2), stiffness.flatten(-2)), -1)
-    mask = placement.articulation.topology.subtree.to(flat.dtype)
-    sums = mask.expand(*flat.shape[:-2], *mask.shape) @ flat
-    return sums[..., :12].unflatten(-1, (3, 4)), sums[..., 12:].unflatten(-1, (6, 6))
+    mask = placement.articulation.topology.subtree.to(moment.dtype)
+    mask = mask.expand(*moment.shape[:-3], *mask.shape)
+    return (mask @ moment.flatten(-2)).unflatten(-1, (3, 4)), (mask @ stiffness.flatten(-2)).unflatten(-1, (6, 6))
 
 
 def link_residual(placement: Placement, moment: Tensor) -> Tensor:

@@ -65,8 +65,8 @@ def center_of_mass(placement: Placement) -> Tensor:
 
 
 def momentum(placement: Placement, rates: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear momentum [kg m/s] and angular momentum about the centre of mass [kg m²/s], each `[*batch, 3]`, for link poses that change
-    at `rates` Ṫ `[*batch, nlink, 3, 4]`: the integrals of ρ ṗ and ρ p × ṗ over the bodies."""
+    """Linear momentum [kg m/s] and angular momentum about the centre of mass [kg m²/s], each `[*batch, 3]`, for link poses
+    that change at `rates` Ṫ `[*batch, nlink, 3, 4]`: the integrals of ρ ṗ and ρ p × ṗ over the bodies."""
     first = (rates @ (placement.poses @ placement.articulation.pseudo_inertia).mT).sum(-3)
     linear = first[..., 3]
     return linear, unskew(first[..., :3]) - torch.linalg.cross(center_of_mass(placement), linear)

@@ -148,7 +148,8 @@ def pose_rates(placement: Placement, v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def retract(articulation: Articulation, q: Tensor, delta: Tensor) -> Tensor:
-    """q moved by the tangent vector `delta` `[*batch, nv]`: sums, and q ⊗ exp(δ) for rotations. Quaternions come out at unit norm."""
+    """q moved by the tangent vector `delta` `[*batch, nv]`: sums, and q ⊗ exp(δ) for rotations. Quaternions come out at unit
+    norm."""
     t = articulation.topology
     parts = [q[..., t.scalar_q] + delta[..., t.scalar_v]]
     if len(t.free_q):

@@ -17,17 +17,24 @@ from pbfd_torch.terms.load import OneSided, StepContext, Term
 
 @dataclass(frozen=True, eq=False)
 class BalanceObjective:
-    """r(θ) of one step for all worlds. `scale` `[*batch, nv]`: the size of a force that counts as one, see `force_scale`."""
+    """r(θ) of one step for all worlds.
+
+    Attributes:
+        articulation, terms, prepared: what acts, and what each term prepared for this step.
+        scale: `[*batch, nv]` the size of a force that counts as one, see `force_scale`.
+        guess: `[*batch, nq]` where inertia alone would end the step.
+    """
 
     articulation: Articulation
     terms: Sequence[Term]
     prepared: Sequence[Any]
     scale: Tensor
+    guess: Tensor
 
     @staticmethod
     def of_step(articulation: Articulation, terms: Sequence[Term], step: StepContext, scale: Tensor) -> BalanceObjective:
         """Prepares every term for the step."""
-        return BalanceObjective(articulation, terms, [term.prepare(step) for term in terms], scale)
+        return BalanceObjective(articulation, terms, [term.prepare(step) for term in terms], scale, step.target_q)
 
     def evaluate(self, q: Tensor) -> Balance:
         """Residual, Jacobian and stiffness at q."""

@@ -29,11 +29,11 @@ class Rollout:
         scene_name, dt, link_names, joint_names: what was simulated, and the step [s].
         time: `[T + 1]` [s].
         q: `[T + 1, *batch, nq]`.
-        v: `[T + 1, *batch, nv]` average velocity over the step that ends at `time` (Eq. 3); entry 0 is that of the virtual step before
-            the start, which differs from the given velocity by half a step's acceleration.
+        v: `[T + 1, *batch, nv]` average velocity over the step that ends at `time` (Eq. 3); entry 0 is that of the virtual
+            step before the start, which differs from the given velocity by half a step's acceleration.
         link_poses: `[T + 1, *batch, nlink, 3, 4]` [R | t].
         center_of_mass: `[T + 1, *batch, 3]`.
-        kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; potential: gravity, springs, limits and the contacts' normal forces.
+        kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; potential: gravity, springs, limits and contacts.
         linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
@@ -83,17 +83,19 @@ class Rollout:
         return self.status <= int(Status.CONTINUED)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all. Raises
-        `InputError` where it cannot be written."""
+        """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all.
+        Raises `InputError` where it cannot be written."""
         target = Path(path)
         meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt}
         meta |= {"link_names": list(self.link_names), "joint_names": list(self.joint_names)}
         arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS}
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=target.parent, suffix=".part", delete=False) as file:
-                np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
-            os.replace(file.name, target)
+            # written beside the target and renamed: the folder goes with whatever an interruption leaves in it
+            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".rollout-") as folder:
+                part = Path(folder) / "rollout.npz"
+                np.savez_compressed(part, meta=np.array(json.dumps(meta)), **arrays)
+                os.replace(part, target)
         except OSError as error:
             raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
 

@@ -112,12 +112,10 @@ def rotation_log(r: Tensor) -> Tensor:
     double_sine = unskew(r)  # 2 sin(angle) · axis
     square = 0.25 * (double_sine * double_sine).sum(-1, keepdim=True)
     cosine = 0.5 * (r.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
-    small, safe = _guarded(square)
-    sine = safe.sqrt()
+    small = (square < _SMALL * _SMALL) & (cosine > 0)
+    sine = torch.where(small, 1.0, square.clamp_min(1e-12)).sqrt()  # no branch divides by zero, at a half turn neither
     series = 1 + square / 6 * (1 + square * 9 / 20 * (1 + square * 25 / 42 * (1 + square * 49 / 72)))
-    far = torch.atan2(sine, cosine) / sine
-    half_turn = torch.atan2(torch.zeros_like(cosine), cosine) / _SMALL  # small sine, but at the far side of the circle
-    return 0.5 * torch.where(small, torch.where(cosine > 0, series, half_turn), far) * double_sine
+    return 0.5 * torch.where(small, series, torch.atan2(sine, cosine) / sine) * double_sine
 
 
 def _curvature(square: Tensor) -> Tensor:

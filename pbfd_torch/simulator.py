@@ -23,7 +23,7 @@ from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.continuation import Continuation
 from pbfd_torch.solvers.objective import Objective, Solution
 from pbfd_torch.terms.actuators import Actuators
-from pbfd_torch.terms.load import Conservative, StepContext, Term
+from pbfd_torch.terms.load import Conservative, Term
 
 
 class Solver(Protocol):
@@ -92,7 +92,8 @@ class Scene:
 
 
 class Simulator:
-    """Steps a scene. `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions' differences."""
+    """Steps a scene. `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions'
+    differences."""
 
     def __init__(self, scene: Scene, dt: float, integrator: ImplicitEuler | None = None, solver: Solver | None = None) -> None:
         if not (math.isfinite(dt) and dt >= 1e-5):
@@ -132,8 +133,11 @@ class Simulator:
             raise InputError(f"{name} holds NaN or infinity")
         return value
 
-    def _context(self, state: State, control: Tensor | None) -> StepContext:
-        return self.integrator.context(self.scene.articulation, state, self._dt, self.scene.gravity, control)
+    def objective(self, state: State, control: Tensor | None = None) -> BalanceObjective:
+        """The balance of forces that the step from `state` solves."""
+        articulation = self.scene.articulation
+        context = self.integrator.context(articulation, state, self._dt, self.scene.gravity, control)
+        return BalanceObjective.of_step(articulation, self.scene.terms, context, self._scale)
 
     def step(self, state: State, control: Tensor | None = None) -> tuple[State, Solution]:
         """One step of all worlds under `control` `[*batch, nu]` (None: zero). Never raises for one bad world: see the solution's
@@ -143,9 +147,8 @@ class Simulator:
 
     def _step(self, state: State, control: Tensor | None) -> tuple[State, Solution, BalanceObjective]:
         with torch.no_grad():
-            context = self._context(state, control)
-            objective = BalanceObjective.of_step(self.scene.articulation, self.scene.terms, context, self._scale)
-            solution = self.solver.solve(objective, context.target_q, state.q)
+            objective = self.objective(state, control)
+            solution = self.solver.solve(objective, objective.guess, state.q)
             return self.integrator.advance(state, solution.q), solution, objective
 
     def rollout(
@@ -157,7 +160,8 @@ class Simulator:
     ) -> Rollout:
         """Steps from `state` and records everything.
 
-        controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step with the
+         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every
+             step with the
         number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
         count = self._count(controls, steps)
         recorder = Recorder(self.scene, self.integrator, self.dt, state)

@@ -51,7 +51,7 @@ def random_inertia(random: torch.Generator, mass: float, size: float = 0.1) -> t
     return tuple((x, y, z) for x, y, z in (0.5 * (inertia + inertia.T)).tolist())
 
 
-def random_tree(seed: int) -> Articulation:
+def random_links(seed: int) -> list[Link]:
     """Nine links with all joint kinds in random order and on random parents: non-trivial axes, anchors, refs, frames and inertias. One
     hinge always hangs on the world; the second fixed link has no mass."""
     random = generator(seed)
@@ -84,7 +84,12 @@ def random_tree(seed: int) -> Articulation:
                 inertia=random_inertia(random, mass),
             )
         )
-    return Articulation.from_links(links)
+    return links
+
+
+def random_tree(seed: int) -> Articulation:
+    """`random_links` as an articulation."""
+    return Articulation.from_links(random_links(seed))
 
 
 def random_q(articulation: Articulation, seed: int, batch: tuple[int, ...] = ()) -> Tensor:

@@ -16,7 +16,8 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Articulated bodies with frictional contact, stable at large time steps. Exit status: 0 solved, 1 some step unsolved, 2 bad input.",
+    help="Articulated bodies with frictional contact, stable at large time steps. "
+    "Exit status: 0 solved, 1 some step unsolved, 2 bad input.",
 )
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)

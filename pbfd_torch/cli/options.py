@@ -21,23 +21,23 @@ from pbfd_torch.terms.pbfd_friction import PbfdFriction
 CALIBRATION_SPEED = 1.0  # [m/s] at which the PBFD law's C∥ gives the scene's μ
 
 
-class Integrator(str, enum.Enum):
+class Integrator(enum.StrEnum):
     IMPLICIT_EULER = "implicit-euler"
 
 
-class SolverChoice(str, enum.Enum):
+class SolverChoice(enum.StrEnum):
     CONTINUATION = "jtj-lm-continuation"
     JTJ_LM = "jtj-lm"
 
 
-class Friction(str, enum.Enum):
+class Friction(enum.StrEnum):
     COULOMB = "coulomb"
     PBFD_PRINTED = "pbfd"
     PBFD_DERIVED = "pbfd-derived"
     NONE = "none"
 
 
-class Dtype(str, enum.Enum):
+class Dtype(enum.StrEnum):
     FLOAT64 = "float64"
     FLOAT32 = "float32"
 
@@ -46,7 +46,7 @@ class Dtype(str, enum.Enum):
         return torch.float64 if self is Dtype.FLOAT64 else torch.float32
 
 
-class Device(str, enum.Enum):
+class Device(enum.StrEnum):
     CPU = "cpu"
     CUDA = "cuda"
 

@@ -22,7 +22,8 @@ Frame = NDArray[np.float64]
 
 
 def draw(setup: Setup, rollout: Rollout, path: Path, strobe_s: float = 0.9) -> None:
-    """Writes a PNG. Left: side view of world 0 during the first `strobe_s` seconds, gravity pointing down. Right: curves over time."""
+    """Writes a PNG. Left: side view of world 0 during the first `strobe_s` seconds, gravity pointing down. Right: curves over
+    time."""
     figure = plt.figure(figsize=(13, 7.5), dpi=130, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.35, 1))
     _strobe(figure.add_subplot(grid[:, 0]), setup, rollout, strobe_s)

@@ -35,7 +35,8 @@ class ImplicitEuler:
         return difference(articulation, state.q_previous, state.q) / dt[..., None]
 
     def pose_rates(self, articulation: Articulation, state: State, dt: Tensor) -> Tensor:
-        """Average rate of change of the link poses over that step, `[*batch, nlink, 3, 4]`; its momentum is the one that is kept."""
+        """Average rate of change of the link poses over that step, `[*batch, nlink, 3, 4]`; its momentum is the one that is
+        kept."""
         moved = place(articulation, state.q).poses - place(articulation, state.q_previous).poses
         return moved[..., :3, :] / dt[..., None, None, None]
 

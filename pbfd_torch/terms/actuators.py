@@ -22,7 +22,8 @@ class Actuator:
     """One actuator on a hinge or slide joint; x = gear · (joint coordinate).
 
     Force before the gear: clamp(gain·u + bias − stiffness·x − damping·ẋ, force_range), u = clamp(control, control_range); the
-    joint feels gear times that. A motor has gain 1; a position servo gain = stiffness = kp; a velocity servo gain = damping = kv."""
+    joint feels gear times that. A motor has gain 1; a position servo gain = stiffness = kp; a velocity servo gain = damping =
+    kv."""
 
     name: str
     joint: str

@@ -1,7 +1,8 @@
 """Contact of candidate points with a half-space: depth, slip, forces, and their exact stiffness.
 
 A candidate is a centre c fixed in a link, a radius ρ ≥ 0 and a margin δ ≥ 0. Its depth is d = ρ + δ − (n·c − h), its force
-acts at c − ρn, and its slip over the step is u = (I − nnᵀ)[(c − c_n) − ρ φ × n] with φ = log(R R_nᵀ): zero for pure rolling (METHOD §4).
+acts at c − ρn, and its slip over the step is u = (I − nnᵀ)[(c − c_n) − ρ φ × n] with φ = log(R R_nᵀ): zero for pure rolling
+(METHOD §4).
 """
 
 from __future__ import annotations
@@ -161,35 +162,40 @@ class Contact:
         force = push[..., None] * normal
         by_depth = push_slope[..., None] * normal
 
-        # K: minus the derivative of the force by the link's twist (ω, v), [*batch, npoint, 3, 6]
-        lever = torch.linalg.cross(centers, normal)
-        approach = torch.cat((lever, normal), -1)[..., None, :]
+        # K: minus the derivative of the force by the link's twist, in its ω and v columns, each [*batch, npoint, 3, 3]
         if self.friction is None:
-            answer = by_depth[..., :, None] * approach
+            turned, shifted = _outer(by_depth, torch.linalg.cross(centers, normal)), _outer(by_depth, normal)
         else:
             slip = self._slip(prepared, placement, centers)
             drag, drag_by_depth, drag_by_slip = self.friction.force(push, push_slope, depth, slip, prepared.dt)
             force = force + drag
-            tangential = drag_by_slip - (drag_by_slip @ normal[..., None]) * normal[..., None, :]
-            arm = -skew(centers)
+            by_depth = by_depth + drag_by_depth
+            tangential = drag_by_slip - _outer((drag_by_slip @ normal[..., None]).squeeze(-1), normal)
+            arm = skew(centers)
             if self.rounded:
-                turning = skew(normal[..., :1, :]) @ log_jacobian_left(self._turn(prepared, placement))
-                arm = arm + self.radius[..., None, None] * turning[..., self.link, :, :]
-            answer = (by_depth + drag_by_depth)[..., :, None] * approach - torch.cat((tangential @ arm, tangential), -1)
+                turning = skew(self.normal) @ log_jacobian_left(self._turn(prepared, placement))
+                arm = arm - self.radius[..., None, None] * turning[..., self.link, :, :]
+            turned = _outer(by_depth, torch.linalg.cross(centers, normal)) + tangential @ arm
+            shifted = _outer(by_depth, normal) - tangential
 
-        points = centers - self.radius[..., None] * normal
-        stiffness = torch.cat((skew(points) @ answer, answer), -2)
+        points = centers - self.radius[..., None] * normal if self.rounded else centers
+        lever = skew(points)
+        twisted = lever @ turned
         if self.rounded:  # the point of application moves with the centre, not with the surface
-            pull = self.radius[..., None, None] * -(normal[..., :, None] * force[..., None, :])
+            pull = self.radius[..., None, None] * _outer(normal, force)
             trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-            eye = torch.eye(3, dtype=pull.dtype, device=pull.device)
-            stiffness = stiffness + torch.nn.functional.pad(pull - trace * eye, (0, 3, 0, 3))
-        moment = torch.cat((-force[..., :, None] * points[..., None, :], -force[..., :, None]), -1)
+            twisted = twisted - pull + trace * torch.eye(3, dtype=pull.dtype, device=pull.device)
 
-        flat = torch.cat((moment.flatten(-2), stiffness.flatten(-2)), -1)
         on_link = self._on_link(placement.poses.shape[-3])
-        total = on_link.expand(*flat.shape[:-2], *on_link.shape) @ flat
-        return LinkLoad(total[..., :12].unflatten(-1, (3, 4)), total[..., 12:].unflatten(-1, (6, 6)))
+        on_link = on_link.expand(*force.shape[:-2], *on_link.shape)
+
+        def summed(blocks: Tensor) -> Tensor:
+            return (on_link @ blocks.flatten(-2)).unflatten(-1, (3, 3))
+
+        upper = torch.cat((summed(twisted), summed(lever @ shifted)), -1)
+        lower = torch.cat((summed(turned), summed(shifted)), -1)
+        moment = torch.cat((summed(_outer(force, points)), (on_link @ force)[..., None]), -1)
+        return LinkLoad(-moment, torch.cat((upper, lower), -2))
 
     def potential(self, placement: Placement) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
@@ -210,3 +216,8 @@ class Contact:
             force = force + self.friction.force(push, push_slope, depth, slip, prepared.dt)[0]
         point = centers - self.radius[..., None] * self.normal[..., None, :]
         return ContactPoints(point, depth, self.normal, force, slip)
+
+
+def _outer(a: Tensor, b: Tensor) -> Tensor:
+    """a bᵀ, `[*, 3], [*, 3] → [*, 3, 3]`."""
+    return a[..., :, None] * b[..., None, :]

@@ -20,7 +20,8 @@ class PreparedInertia:
 
 @dataclass(frozen=True)
 class Inertia:
-    """I(θ) = κ/2 Σ tr(D S Dᵀ), D = T − T̂: the links' pseudo-inertias pulled to the integrator's target poses, which hold gravity."""
+    """I(θ) = κ/2 Σ tr(D S Dᵀ), D = T − T̂: the links' pseudo-inertias pulled to the integrator's target poses, which hold
+    gravity."""
 
     def prepare(self, step: StepContext) -> PreparedInertia:
         return PreparedInertia(step.weight[..., None, None, None], step.target_poses)

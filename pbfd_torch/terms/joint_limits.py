@@ -22,8 +22,8 @@ class JointLimits:
 
     @staticmethod
     def for_articulation(articulation: Articulation, gravity: float = 9.81, violation: float = 2e-3) -> JointLimits:
-        """Stiffness for which the whole weight (m g for a slide, m g · reach for a hinge) rests `violation` [rad or m] past a limit.
-        Reach: see `articulation.reach`. Raises `InputError` for a violation ≤ 0."""
+        """Stiffness for which the whole weight (m g for a slide, m g · reach for a hinge) rests `violation` [rad or m] past a
+        limit. Reach: see `articulation.reach`. Raises `InputError` for a violation ≤ 0."""
         if not (math.isfinite(violation) and violation > 0):
             raise InputError(f"violation is {violation}: must be > 0 and finite")
         return JointLimits(force_scale(articulation, gravity) / violation**2)

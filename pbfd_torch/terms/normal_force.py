@@ -12,7 +12,8 @@ from pbfd_torch.errors import InputError
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
-    """base ** exponent for base ≥ 0 and exponent ≥ 0; whole exponents by products, so that a batch and a single world round alike."""
+    """base ** exponent for base ≥ 0 and exponent ≥ 0; whole exponents by products, so that a batch and a single world round
+    alike."""
     if exponent == int(exponent) and exponent <= 4:
         result = torch.ones_like(base)
         for _ in range(int(exponent)):

@@ -49,8 +49,8 @@ class PbfdFriction:
         return PbfdFriction(stiffness, beta, gamma, beta - 1)
 
     def calibrated(self, mu: float | Tensor, normal_stiffness: float | Tensor, speed: float, dt: float) -> PbfdFriction:
-        """The same law with the C∥ at which a contact sliding at `speed` [m/s] feels μ: with α = 2 and γ = 1 friction is proportional to
-        the normal force, μ = (β + 1) (C∥/C⊥) (v Δt)^{e + 1} (METHOD §4). It holds at this speed and Δt only."""
+        """The same law with the C∥ at which a contact sliding at `speed` [m/s] feels μ: with α = 2 and γ = 1 friction is
+        proportional to the normal force, μ = (β + 1) (C∥/C⊥) (v Δt)^{e + 1} (METHOD §4). It holds at this speed and Δt only."""
         share = (self.beta + 1) * (speed * dt) ** (self.slip_exponent + 1)
         return replace(self, stiffness=mu * normal_stiffness / share)
 
