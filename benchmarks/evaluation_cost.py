@@ -72,7 +72,7 @@ def evaluate_and_solve(objective: BalanceObjective, q: Tensor) -> Tensor:
 
 
 def jacobian_error(objective: BalanceObjective, q: Tensor, h: float = 1e-7) -> float:
-    """Relative difference of the exact Jacobian's hinge columns from central differences (a free rotation's would need its chart)."""
+    """Relative difference of the exact Jacobian's hinge columns from central differences."""
     balance = objective.evaluate(q)
     articulation = objective.articulation
     columns = []

@@ -18,7 +18,7 @@ def robot_setup(robot: Robot, worlds: int = 1, duration: float = 2.0) -> Setup:
     """The robot at its rest configuration, without control. A robot that can fall and whose file knows no ground gets a level
     one just below it."""
     free = any(size == (7, 6) for size in robot.articulation.topology.joint_sizes)
-    notes = list(robot.not_modelled)
+    notes = [f"not modelled: {line}" for line in robot.not_modelled]
     obstacles = robot.obstacles
     if free and not obstacles and robot.colliders and any(robot.gravity):
         obstacles = (ground_below(robot),)

@@ -33,7 +33,7 @@ class _Search:
     low_work: Tensor  # φ(low) < 0
     high: Tensor  # inf until a step has gone past the zero
     high_work: Tensor
-    error: Tensor  # ‖r/scale‖₂ at q
+    error: Tensor  # the residual's norm at q
     status: Tensor
     running: Tensor
     iterations: Tensor
@@ -43,7 +43,8 @@ class _Search:
 @dataclass(frozen=True)
 class JtjLm:
     """Attributes:
-    tolerance: solved when ‖r/scale‖₂ is at or below it; scale is about the scene's weight. None: 1e-9 in float64, 1e-4 in float32.
+    tolerance: solved when ‖r / (scale + rounding/tolerance)‖₂ is at or below it; scale is about the scene's weight. None: 1e-9 in
+        float64, 1e-3 in float32.
     max_evaluations: evaluations of the residual before a world is given up.
     max_turn: largest rotation of a joint in one step [rad].
     overshoot: a step ends where the work is at most this share of the work at its start.
@@ -59,7 +60,7 @@ class JtjLm:
     def solve(self, objective: Objective, guess: Tensor, retreat: Tensor | None = None) -> Solution:
         """Solves all worlds from `guess` `[*batch, nq]`; never raises for one bad world. `retreat`: a second, safer guess. Between
         rounds the host asks whether any world still runs; nothing else leaves the device."""
-        tolerance = self.tolerance if self.tolerance is not None else (1e-9 if guess.dtype == torch.float64 else 1e-4)
+        tolerance = self.tolerance if self.tolerance is not None else (1e-9 if guess.dtype == torch.float64 else 1e-3)
         with torch.no_grad():
             search = self._begin(objective, guess, retreat, tolerance)
             for _ in range(self.max_evaluations - 1):
@@ -71,12 +72,12 @@ class JtjLm:
 
     def _begin(self, objective: Objective, guess: Tensor, retreat: Tensor | None, tolerance: float) -> _Search:
         evaluation = objective.evaluate(guess)
-        error = _error(objective, evaluation)
+        error = _error(objective, evaluation, tolerance)
         evaluations = torch.ones_like(error, dtype=torch.int32)
         far = ~(error <= self.retreat_above)
         if retreat is not None and bool(far.any()):
             other = objective.evaluate(retreat)
-            other_error = _error(objective, other)
+            other_error = _error(objective, other, tolerance)
             swap = far & ~(other_error >= error)
             guess = torch.where(swap[..., None], retreat, guess)
             error = torch.where(swap, other_error, error)
@@ -122,7 +123,7 @@ class JtjLm:
 
     def _round(self, objective: Objective, search: _Search, tolerance: float) -> _Search:
         evaluation = objective.evaluate(search.trial)
-        error = _error(objective, evaluation)
+        error = _error(objective, evaluation, tolerance)
         finite = torch.isfinite(error)
         work = (evaluation.residual * search.direction).sum(-1)
         balanced = work.abs() <= self.overshoot * search.start_work.abs()
@@ -176,8 +177,8 @@ class _Chosen:
         self.stiffness = torch.where(swap[..., None, None], yes.stiffness, no.stiffness)
 
 
-def _error(objective: Objective, evaluation: Evaluation) -> Tensor:
-    return torch.linalg.vector_norm(evaluation.residual / objective.scale, dim=-1)
+def _error(objective: Objective, evaluation: Evaluation, tolerance: float) -> Tensor:
+    return torch.linalg.vector_norm(evaluation.residual / (objective.scale + objective.rounding / tolerance), dim=-1)
 
 
 def _descent(evaluation: Evaluation) -> Tensor:

@@ -46,6 +46,11 @@ class Objective(Protocol):
         """Size of a residual entry that counts as one, broadcastable to `[*batch, n]`."""
         ...
 
+    @property
+    def rounding(self) -> Tensor:
+        """Size of the rounding error in a residual entry, likewise; nothing smaller can be asked for."""
+        ...
+
     def evaluate(self, q: Tensor) -> Evaluation:
         """Residual and Jacobian at q `[*batch, nq]`."""
         ...
@@ -68,7 +73,7 @@ class Solution:
     """Attributes, each per world:
     q: `[*batch, nq]` the best point found; the guess itself, bitwise, where it solves the problem.
     status: `[*batch]` int, values of `Status`.
-    residual_norm: `[*batch]` ‖r / scale‖₂.
+    residual_norm: `[*batch]` ‖r / (scale + rounding/tolerance)‖₂.
     iterations: `[*batch]` int, steps taken.
     evaluations: `[*batch]` int, evaluations of the residual spent.
     """

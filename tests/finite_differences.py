@@ -7,6 +7,7 @@ axes, so the residual pulled back to the chart is Jr(δ)ᵀ r(q ⊕ δ) for rota
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -39,7 +40,7 @@ def derivative(
     answer = torch.full_like(column[0], math.nan)
     for order in range(1, 4):
         share = 4.0**order
-        extrapolated = [(share * b - a) / (share - 1) for a, b in zip(column[:-1], column[1:], strict=True)]
+        extrapolated = [(share * b - a) / (share - 1) for a, b in itertools.pairwise(column)]
         for a, b, value in zip(column[:-1], column[1:], extrapolated, strict=True):
             error = torch.maximum((value - a).abs(), (value - b).abs()).amax((0, -1), keepdim=True)
             answer = torch.where(error < best, value, answer)
@@ -80,8 +81,8 @@ def jacobian(articulation: Articulation, residual: Callable[[Tensor], Tensor], q
 
 
 def relative_error(value: Tensor, reference: Tensor, floor: Tensor | float = 0.0) -> float:
-    """Largest |value − reference| over the largest |reference| of each matrix, worst world. `floor` `[*batch]`: matrices count as at least
-    that large, for references that are zero."""
+    """Largest |value − reference| over the largest |reference| of each matrix, worst world. `floor` `[*batch]`: matrices count as
+    at least that large, for references that are zero."""
     size = reference.abs().amax((-2, -1)).clamp_min(floor)
     error = (value - reference).abs().amax((-2, -1))
     return float((error / torch.where(size > 0, size, torch.ones_like(size))).max())

@@ -52,8 +52,8 @@ def random_inertia(random: torch.Generator, mass: float, size: float = 0.1) -> t
 
 
 def random_links(seed: int) -> list[Link]:
-    """Nine links with all joint kinds in random order and on random parents: non-trivial axes, anchors, refs, frames and inertias. One
-    hinge always hangs on the world; the second fixed link has no mass."""
+    """Nine links with all joint kinds in random order and on random parents: non-trivial axes, anchors, refs, frames and inertias.
+    One hinge always hangs on the world; the second fixed link has no mass."""
     random = generator(seed)
     order = torch.randperm(len(PATTERNS), generator=random).tolist()
     links: list[Link] = []

@@ -114,8 +114,8 @@ def contact(
 
 
 def actuators(s: Situation) -> Actuators:
-    """Six actuators: two motors, one of them past its effort; two position and two velocity servos, one of each past its effort. Two
-    of them drive one joint."""
+    """Six actuators: two motors, one of them past its effort; two position and two velocity servos, one of each past its effort.
+    Two of them drive one joint."""
     names = [s.articulation.joint_names[int(j)] for j in s.articulation.topology.scalar_joint]
     return Actuators.from_list(
         s.articulation,
@@ -147,7 +147,7 @@ def dry_torque(s: Situation) -> Tensor:
 
 @dataclass(frozen=True)
 class TermCase:
-    """`build` makes the term for a situation. `stores`: how it stores energy: "" not at all, "energy" over the step, "potential"."""
+    """`build` makes the term for a situation. `stores`: its method that gives the energy, "energy" or "potential", or "" for none."""
 
     name: str
     build: Callable[[Situation], Term]

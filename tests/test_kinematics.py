@@ -258,7 +258,7 @@ def test_batch_equals_its_worlds(batch: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("batch", [(3,), (2, 3)], ids=str)
 @pytest.mark.parametrize("shared_q", [True, False], ids=["one q", "q per world"])
 def test_parameters_may_differ_from_world_to_world(batch: tuple[int, ...], shared_q: bool) -> None:
-    """joint_frame, joint_axis, joint_ref, link_frame and pseudo_inertia `[*batch, …]` broadcast against q `[nq]` or `[*batch, nq]`."""
+    """Frames, axes, refs and pseudo-inertias `[*batch, …]` broadcast against q, `[nq]` or `[*batch, nq]`."""
     articulation = random_tree(2)
     random = generator(8)
 
@@ -278,7 +278,7 @@ def test_parameters_may_differ_from_world_to_world(batch: tuple[int, ...], share
         "link_frame": articulation.link_frame + shift,
         "pseudo_inertia": articulation.pseudo_inertia * scale,
     }
-    many = dataclasses.replace(articulation, **changed)  # type: ignore[arg-type]
+    many = dataclasses.replace(articulation, **changed)
     q = random_q(articulation, 5, () if shared_q else batch)
     v = tangent(articulation, 6, batch)
     whole = place(many, q)
@@ -286,7 +286,7 @@ def test_parameters_may_differ_from_world_to_world(batch: tuple[int, ...], share
     rates = pose_rates(whole, v)
     for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
         at = tuple(index)
-        one = dataclasses.replace(articulation, **{name: value[at] for name, value in changed.items()})  # type: ignore[arg-type]
+        one = dataclasses.replace(articulation, **{name: value[at] for name, value in changed.items()})
         alone = place(one, q if shared_q else q[at])
         torch.testing.assert_close(whole.poses[at], alone.poses, rtol=0, atol=1e-15)
         torch.testing.assert_close(whole.axes[at], alone.axes, rtol=0, atol=1e-15)
@@ -354,7 +354,7 @@ def test_forward_mode_sees_the_parameters() -> None:
 
     inputs = (articulation.joint_frame, articulation.joint_axis)
     tangents = tuple(torch.randn(x.shape, dtype=torch.float64, generator=generator(9)) for x in inputs)
-    _, forward = torch.func.jvp(poses, inputs, tangents)
+    _, forward, *_ = torch.func.jvp(poses, inputs, tangents)
     _, backward = torch.autograd.functional.jvp(poses, inputs, tangents)
     assert float(backward.abs().max()) > 0.1
     torch.testing.assert_close(forward, backward, rtol=0, atol=1e-12)

@@ -49,8 +49,8 @@ def jacobian_error(s: Situation, terms: list[Term]) -> float:
 
 @all_trees
 def test_situations_hold_what_the_cases_need(seed: int) -> None:
-    """In every world some candidates touch and some do not, the sticking ones slip less than the width ε_v Δt, the sliding ones more than
-    ten times it; some joints are below their range, some above it and some inside."""
+    """In every world some candidates touch and some do not, the sticking ones slip less than the width ε_v Δt, the sliding ones more
+    than ten times it; some joints are below their range, some above it and some inside."""
     s = situation(seed, (2,))
     placement, context = place(s.articulation, s.q), s.context(s.q)
     for shapes in (ROUND, (Point(),)):
@@ -123,8 +123,8 @@ def test_residual_and_jacobian_derive_from_the_energy(case: TermCase, seed: int)
 
 @all_terms
 def test_stiffness_of_conservative_terms_is_symmetric_and_never_pulls(case: TermCase) -> None:
-    """The stiffness (J without the tree's curvature) is the solver's fallback: for terms that store energy it is symmetric, and with
-    the inertia it is positive semi-definite. With friction it is finite."""
+    """The stiffness (J without the tree's curvature) is the solver's fallback: for terms that store energy it is symmetric and
+    positive semi-definite. With friction it is finite."""
     s = situation(0, (3,))
     stiffness = s.balance([case.build(s)], s.q).stiffness
     assert bool(torch.isfinite(stiffness).all())
@@ -257,7 +257,7 @@ def test_poisoned_world_harms_no_other(case: TermCase) -> None:
 
 @all_terms
 def test_batch_equals_its_worlds(case: TermCase) -> None:
-    """A batch `[2, 3]` gives what each of its worlds gives alone, also where limits and ground height differ from world to world."""
+    """A batch `[2, 3]` gives what each of its worlds gives alone, also where limits and ground height differ between worlds."""
     s = situation(1, (2, 3))
     term = case.build(s)
     whole = s.balance([term], s.q)
@@ -354,7 +354,9 @@ def test_softened_contact_and_limits() -> None:
 # Closed forms: one body on a plane ------------------------------------------------------------------------------------
 
 
-def one_body(shape: Shape, friction: FrictionLaw | None, stiffness: float = 1e6, margin: float = 0.0) -> tuple[Articulation, Contact]:
+def one_body(
+    shape: Shape, friction: FrictionLaw | None, stiffness: float = 1e6, margin: float = 0.0
+) -> tuple[Articulation, Contact]:
     """A free body of 1 kg with one collider at its origin, on the plane z = 0."""
     eye = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
     articulation = Articulation.from_links([Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.0, inertia=eye)])
@@ -411,7 +413,7 @@ def test_slip_factor_is_smooth() -> None:
 @pytest.mark.parametrize("beta", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("printed", [True, False], ids=["as printed", "as derived"])
 def test_pbfd_friction_is_coulombs_with_a_calibrated_mu(beta: float, printed: bool) -> None:
-    """With α = 2, γ = 1: f∥ = −μ_eff N u/‖u‖, μ_eff = (β + 1)(C∥/C⊥)(v Δt)^{β+1} as printed, ^β as derived, at any depth (METHOD §4)."""
+    """With α = 2, γ = 1: f∥ = −μ_eff N u/‖u‖, μ_eff = (β + 1)(C∥/C⊥)(v Δt)^{β+1} as printed, ^β as derived, at any depth."""
     tangential, normal_stiffness, dt, speed = 4e5, 1e6, 0.02, 0.7
     law = (PbfdFriction.as_printed if printed else PbfdFriction.as_derived)(tangential, beta, 1.0)
     articulation, made = one_body(Point(), law, normal_stiffness)
@@ -426,7 +428,7 @@ def test_pbfd_friction_is_coulombs_with_a_calibrated_mu(beta: float, printed: bo
 @pytest.mark.parametrize("angle", [1e-6, 0.01, 0.5, 2.0, 3.1])
 @pytest.mark.parametrize("direction", [0.0, 0.8])
 def test_pure_rolling_does_not_slip(angle: float, direction: float) -> None:
-    """A sphere that turns by φ while its centre moves by φ × ρ n has u = 0 at every angle φ < π, not Rφ³/6 as the chord would (METHOD §4);
+    """A sphere that turns by φ while its centre moves by φ × ρ n has u = 0 at every angle φ < π, where the chord has Rφ³/6 (METHOD §4);
     and so does every sphere of a capsule that rolls across its axis."""
     radius, depth = 0.05, 1e-3
     axis = (-math.sin(direction), math.cos(direction), 0.0)
@@ -461,7 +463,7 @@ def test_spinning_in_place_slips() -> None:
 
 
 def test_force_acts_at_the_surface() -> None:
-    """Friction of a sphere acts at c − ρn: its moment about the centre is (−ρ n) × f; a point with a margin feels it at its centre."""
+    """Friction of a sphere acts at c − ρn: its moment about the centre is (−ρ n) × f; a point with a margin feels it itself."""
     for shape, margin, lever in ((Sphere(0.05), 0.0, 0.05), (Point(), 0.05, 0.0)):
         articulation, made = one_body(shape, CoulombFriction(0.5), margin=margin)
         before = pose((0.4, -0.3, 0.049))
@@ -508,8 +510,8 @@ def test_dry_friction_torque() -> None:
 
 
 def test_actuator_forces() -> None:
-    """Force gear · clamp(gain·u + bias − kp·x − kv·ẋ, effort) at x = gear·q, control clamped to its range; several actuators on one joint
-    add up."""
+    """Force gear · clamp(gain·u + bias − kp·x − kv·ẋ, effort) at x = gear·q, control clamped to its range; several actuators on one
+    joint add up."""
     s = situation(0)
     a = s.articulation
     name = a.joint_names[int(a.topology.scalar_joint[0])]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -81,6 +82,14 @@ def _coefficient(robot: Robot, kind: type, field: str, dof: int) -> float:
     return sum(float(getattr(term, field)[dof]) for term in robot.joint_terms if isinstance(term, kind))
 
 
+def _table(*headers: str) -> Table:
+    """A table that breaks long names where it has to, and never drops a part of them."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for header in headers:
+        table.add_column(header, overflow="fold")
+    return table
+
+
 def _print(contents: dict[str, Any]) -> None:
     console = Console()
     console.print(
@@ -88,10 +97,10 @@ def _print(contents: dict[str, Any]) -> None:
         f"{contents['mass_kg']:.6g} kg, gravity {contents['gravity_m_s2']}",
         markup=False,
     )
-    links = Table("link", "parent", "mass [kg]", "shapes", title="links", title_justify="left")
+    links = _table("link", "parent", "mass [kg]", "shapes")
     for x in contents["links"]:
         links.add_row(x["name"], x["parent"] or "world", f"{x['mass_kg']:.6g}", ", ".join(x["shapes"]))
-    joints = Table("joint", "kind", "link", "range", "armature", "damping", title="joints", title_justify="left")
+    joints = _table("joint", "kind", "link", "range", "armature", "damping")
     for x in contents["joints"]:
         low, high = x["range"]
         limits = (

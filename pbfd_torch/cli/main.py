@@ -72,7 +72,7 @@ def scenes() -> None:
     from pbfd_torch.models import SCENES
 
     for name, build in SCENES.items():
-        print(f"{name:18s} {(build.__doc__ or '').strip().splitlines()[0]}")
+        print(f"{name:18s} {' '.join((build.__doc__ or '').split())}")
 
 
 @app.command()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,14 +72,17 @@ def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
     """The named scene or the file, in the wanted number of worlds, on the wanted device. Raises `InputError` or `ModelError`."""
     if worlds is not None and worlds < 1:
         raise InputError(f"--worlds is {worlds}: must be ≥ 1")
+    if choices.seed is not None and not -(2**63) <= choices.seed < 2**64:
+        raise InputError(f"--seed is {choices.seed}: must be from -2⁶³ to 2⁶⁴ - 1")
     if choices.device is Device.CUDA and not torch.cuda.is_available():
         raise InputError("--device is cuda, but PyTorch finds no CUDA device: choose cpu")
     if scene in SCENES:
         if choices.free_base is not None:
-            raise InputError("--fixed-base and --free-base are for URDF files only")
+            given = "--free-base" if choices.free_base else "--fixed-base"
+            raise InputError(f"{given} is for URDF files only: leave it out for the scene '{scene}'")
         count = {} if worlds is None else {"worlds": worlds}
         setup = SCENES[scene](**count, dtype=choices.dtype.torch, device=choices.device.value)
-    elif Path(scene).suffix or Path(scene).exists():
+    elif Path(scene).suffix or os.path.exists(scene):
         setup = file_setup(scene, worlds or 1, choices.dtype.torch, choices.device.value, choices.free_base)
     else:
         raise InputError(f"'{scene}' is no file and no named scene: the scenes are {', '.join(SCENES)}")

@@ -12,14 +12,18 @@ from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
-    """`path` as an existing, non-empty file; raises `ModelError` saying which of these it is not."""
+    """`path` as an existing, readable, non-empty file; raises `ModelError` saying which of these it is not."""
     file = Path(path)
-    if file.is_dir():
-        raise ModelError("is a directory: must be a file", file=str(file))
-    if not file.is_file():
-        raise ModelError("no such file", file=str(file))
-    if file.stat().st_size == 0:
-        raise ModelError("the file is empty", file=str(file))
+    try:
+        if file.is_dir():
+            raise ModelError("is a directory: must be a file", file=str(file))
+        if not file.is_file():
+            raise ModelError("no such file", file=str(file))
+        with file.open("rb") as stream:
+            if not stream.read(1):
+                raise ModelError("the file is empty", file=str(file))
+    except OSError as error:
+        raise ModelError(f"cannot be read: {error.strerror or error}", file=str(file)) from error
     return file
 
 
