@@ -23,6 +23,7 @@ class Setup:
     dt: step [s] that suits it.
     report: (setup, rollout) → named numbers, a list having one entry per world; see `metrics`.
     notes: what a reader of the result should know.
+    control: `[nu]` held throughout, or None for zero.
     """
 
     scene: Scene
@@ -32,10 +33,16 @@ class Setup:
     dt: float
     report: Callable[[Setup, Rollout], Mapping[str, Metric]] = field(default=lambda setup, rollout: {})
     notes: Sequence[str] = ()
+    control: Tensor | None = None
 
     def metrics(self, rollout: Rollout) -> dict[str, Metric]:
         """The scene's own numbers for a rollout from this setup."""
         return dict(self.report(self, rollout))
+
+    def controls(self, steps: int) -> Tensor:
+        """The control of every step and world, `[steps, worlds, nu]`."""
+        held = self.q.new_zeros(self.scene.nu) if self.control is None else self.control
+        return held.expand(steps, self.worlds, self.scene.nu)
 
     @property
     def worlds(self) -> int:

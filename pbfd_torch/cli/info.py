@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -84,18 +83,16 @@ def _coefficient(robot: Robot, kind: type, field: str, dof: int) -> float:
 
 def _table(*headers: str) -> Table:
     """A table that breaks long names where it has to, and never drops a part of them."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold cyan")
     for header in headers:
         table.add_column(header, overflow="fold")
     return table
 
 
 def _print(contents: dict[str, Any]) -> None:
-    console = Console()
-    console.print(
+    print(
         f"{contents['name']}: {len(contents['links'])} links, {contents['nv']} degrees of freedom, {contents['nu']} actuators, "
-        f"{contents['mass_kg']:.6g} kg, gravity {contents['gravity_m_s2']}",
-        markup=False,
+        f"{contents['mass_kg']:.6g} kg, gravity {contents['gravity_m_s2']}\n"
     )
     links = _table("link", "parent", "mass [kg]", "shapes")
     for x in contents["links"]:
@@ -109,12 +106,9 @@ def _print(contents: dict[str, Any]) -> None:
             else f"{-float('inf') if low is None else low:.4g} … {float('inf') if high is None else high:.4g}"
         )
         joints.add_row(x["name"], x["kind"], x["link"], limits, f"{x['armature']:.4g}", f"{x['damping']:.4g}")
-    console.print(links, joints)
+    Console(markup=False, emoji=False).print(links, "", joints, "", sep="\n")
     for key in ("actuators", "keyframes", "terms"):
-        console.print(f"{key}: {', '.join(contents[key]) or 'none'}", markup=False)
+        print(f"{key}: {', '.join(contents[key]) or 'none'}")
     for obstacle in contents["obstacles"]:
-        console.print(
-            f"obstacle: {obstacle['name']}, half-space with normal {obstacle['normal']} at {obstacle['offset_m']:.4g} m",
-            markup=False,
-        )
-    console.print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"), markup=False)
+        print(f"obstacle: {obstacle['name']}, half-space with normal {obstacle['normal']} at {obstacle['offset_m']:.4g} m")
+    print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"))

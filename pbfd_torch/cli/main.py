@@ -41,13 +41,16 @@ def simulate(
         bool | None,
         typer.Option("--fixed-base/--free-base", help="URDF only: is the root welded to the world?", show_default=False),
     ] = None,
+    keyframe: Annotated[
+        str | None, typer.Option(help="MJCF only: start from this named state of the file, its control held.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Write the rollout to this .npz file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Simulates a scene or a robot file and reports how it went."""
     from pbfd_torch.cli.simulate import run
 
-    choices = Choices(integrator, solver, friction, dtype, device, seed, None if fixed_base is None else not fixed_base)
+    choices = Choices(integrator, solver, friction, dtype, device, seed, None if fixed_base is None else not fixed_base, keyframe)
     raise typer.Exit(run(load_setup(scene, worlds, choices), choices, duration, dt, out, as_json))
 
 

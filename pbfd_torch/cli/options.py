@@ -63,6 +63,7 @@ class Choices:
     device: Device = Device.CPU
     seed: int | None = None
     free_base: bool | None = None
+    keyframe: str | None = None
 
     def make_solver(self) -> Solver:
         return Continuation() if self.solver is SolverChoice.CONTINUATION else JtjLm()
@@ -83,7 +84,7 @@ def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
         count = {} if worlds is None else {"worlds": worlds}
         setup = SCENES[scene](**count, dtype=choices.dtype.torch, device=choices.device.value)
     elif Path(scene).suffix or os.path.exists(scene):
-        setup = file_setup(scene, worlds or 1, choices.dtype.torch, choices.device.value, choices.free_base)
+        setup = file_setup(scene, worlds or 1, choices.dtype.torch, choices.device.value, choices.free_base, choices.keyframe)
     else:
         raise InputError(f"'{scene}' is no file and no named scene: the scenes are {', '.join(SCENES)}")
     return setup if choices.seed is None else _shaken(setup, choices.seed)

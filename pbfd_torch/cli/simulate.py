@@ -100,7 +100,9 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     simulator = Simulator(setup.scene, dt, solver=choices.make_solver())
     started = time.perf_counter()
     with tqdm(total=steps, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
-        rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), steps=steps, progress=lambda done: bar.update())
+        controls = setup.controls(steps)
+        state = simulator.initial_state(setup.q, setup.v, controls[0])
+        rollout = simulator.rollout(state, controls, progress=lambda done: bar.update())
     wall = time.perf_counter() - started
     if rollout.steps < steps:
         print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)
@@ -127,17 +129,17 @@ def print_summary(result: Result, out: Path | None) -> None:
     table.add_column()
     for key, value in (summary | metrics).items():
         table.add_row(key, _text(value))
-    console = Console()
+    console = Console(markup=False, emoji=False)
     console.print(table)
     for note in notes:
-        console.print(f"note: {note}", markup=False)
+        print(f"note: {note}")
     if not bool(result.rollout.solved.all()):
         bad = int((~result.rollout.solved).any(0).sum())
         console.print(
             f"{bad} of {summary['worlds']} worlds have unsolved steps: their motion after those is not to be trusted", style="red"
         )
     if out is not None:
-        console.print(f"rollout written to {out}", markup=False)
+        print(f"rollout written to {out}")
 
 
 def _text(value: Any) -> str:
