@@ -33,7 +33,8 @@ class Rollout:
             step before the start, which differs from the given velocity by half a step's acceleration.
         link_poses: `[T + 1, *batch, nlink, 3, 4]` [R | t].
         center_of_mass: `[T + 1, *batch, 3]`.
-        kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; potential: gravity, springs, limits and contacts.
+        kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; kinetic: of the average velocity, so half a step
+            earlier than the potential one, which holds gravity, springs, limits and contacts.
         linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:

@@ -147,7 +147,7 @@ def dry_torque(s: Situation) -> Tensor:
 
 @dataclass(frozen=True)
 class TermCase:
-    """`build` makes the term for a situation. `stores`: its method that gives the energy, "energy" or "potential", or "" for none."""
+    """`build` makes the term for a situation. `stores`: its method that gives the energy, "energy" or "potential", or ""."""
 
     name: str
     build: Callable[[Situation], Term]

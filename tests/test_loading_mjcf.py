@@ -137,7 +137,8 @@ def test_mesh_stands_where_the_file_says(tmp_path: Path) -> None:
 
 def test_friction_and_condim(tmp_path: Path) -> None:
     geoms = "<geom name='a' size='1' friction='0.3'/><geom name='b' size='1' condim='1'/>"
-    assert [x.friction for x in loaded(tmp_path, f"<body><joint/>{geoms}</body>").colliders] == [0.3, 0]
+    found = loaded(tmp_path, f"<body><joint/>{geoms}</body>").colliders
+    assert [(x.friction, x.frictionless) for x in found] == [(0.3, False), (1, True)]
 
 
 def test_planes_on_the_world_are_obstacles(robot: Robot) -> None:

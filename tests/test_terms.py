@@ -49,7 +49,7 @@ def jacobian_error(s: Situation, terms: list[Term]) -> float:
 
 @all_trees
 def test_situations_hold_what_the_cases_need(seed: int) -> None:
-    """In every world some candidates touch and some do not, the sticking ones slip less than the width ε_v Δt, the sliding ones more
+    """In every world some candidates touch and some do not, sticking ones slip less than the width ε_v Δt, sliding ones more
     than ten times it; some joints are below their range, some above it and some inside."""
     s = situation(seed, (2,))
     placement, context = place(s.articulation, s.q), s.context(s.q)
@@ -428,7 +428,7 @@ def test_pbfd_friction_is_coulombs_with_a_calibrated_mu(beta: float, printed: bo
 @pytest.mark.parametrize("angle", [1e-6, 0.01, 0.5, 2.0, 3.1])
 @pytest.mark.parametrize("direction", [0.0, 0.8])
 def test_pure_rolling_does_not_slip(angle: float, direction: float) -> None:
-    """A sphere that turns by φ while its centre moves by φ × ρ n has u = 0 at every angle φ < π, where the chord has Rφ³/6 (METHOD §4);
+    """A sphere that turns by φ while its centre moves by φ × ρ n has u = 0 at every angle φ < π, where the chord has Rφ³/6;
     and so does every sphere of a capsule that rolls across its axis."""
     radius, depth = 0.05, 1e-3
     axis = (-math.sin(direction), math.cos(direction), 0.0)

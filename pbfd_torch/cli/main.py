@@ -27,12 +27,12 @@ _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scene
 def simulate(
     scene: Annotated[str, _SCENE],
     worlds: Annotated[int | None, typer.Option(help="Independent worlds in the batch; default: what the scene has.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Simulated time [s]; default: the scene's.")] = None,
-    dt: Annotated[float | None, typer.Option(help="Time step [s]; default: the scene's.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")] = None,
+    dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: the scene's.")] = None,
     integrator: Annotated[Integrator, typer.Option(help="Time integrator.")] = Integrator.IMPLICIT_EULER,
     solver: Annotated[
-        SolverChoice, typer.Option(help="Solver: with or without continuation where a step stalls.")
-    ] = SolverChoice.CONTINUATION,
+        SolverChoice, typer.Option(help="Solver; direct: without continuation where a step stalls.")
+    ] = SolverChoice.JTJ_LM,
     friction: Annotated[Friction | None, typer.Option(help="Friction law; default: the scene's (Coulomb).")] = None,
     dtype: Annotated[Dtype, typer.Option(help="Floating-point type.")] = Dtype.FLOAT64,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.CPU,
@@ -86,9 +86,14 @@ def demo(out: Annotated[Path, typer.Option(help="Folder for the rollout and the 
     raise typer.Exit(run(out))
 
 
+def _one_line(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    return f"pbfd: warning: {message}\n"
+
+
 def main() -> None:
     """Entry point. Bad input ends with status 2 and one line that names it."""
     warnings.simplefilter("ignore", NotModelledWarning)  # the commands list these lines themselves
+    warnings.formatwarning = _one_line
     try:
         app()
     except PbfdError as error:

@@ -27,8 +27,8 @@ class Integrator(enum.StrEnum):
 
 
 class SolverChoice(enum.StrEnum):
-    CONTINUATION = "jtj-lm-continuation"
     JTJ_LM = "jtj-lm"
+    JTJ_LM_DIRECT = "jtj-lm-direct"
 
 
 class Friction(enum.StrEnum):
@@ -57,7 +57,7 @@ class Choices:
     """What the user chose, besides the scene, its length and where the result goes."""
 
     integrator: Integrator = Integrator.IMPLICIT_EULER
-    solver: SolverChoice = SolverChoice.CONTINUATION
+    solver: SolverChoice = SolverChoice.JTJ_LM
     friction: Friction | None = None
     dtype: Dtype = Dtype.FLOAT64
     device: Device = Device.CPU
@@ -66,7 +66,7 @@ class Choices:
     keyframe: str | None = None
 
     def make_solver(self) -> Solver:
-        return Continuation() if self.solver is SolverChoice.CONTINUATION else JtjLm()
+        return Continuation() if self.solver is SolverChoice.JTJ_LM else JtjLm()
 
 
 def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
@@ -81,6 +81,8 @@ def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
         if choices.free_base is not None:
             given = "--free-base" if choices.free_base else "--fixed-base"
             raise InputError(f"{given} is for URDF files only: leave it out for the scene '{scene}'")
+        if choices.keyframe is not None:
+            raise InputError(f"--keyframe is for MJCF files only: leave it out for the scene '{scene}'")
         count = {} if worlds is None else {"worlds": worlds}
         setup = SCENES[scene](**count, dtype=choices.dtype.torch, device=choices.device.value)
     elif Path(scene).suffix or os.path.exists(scene):
@@ -99,7 +101,10 @@ def _shaken(setup: Setup, seed: int) -> Setup:
 
 
 def with_friction(setup: Setup, choice: Friction | None, dt: float) -> Setup:
-    """The setup with another friction law in all its contacts; the PBFD laws are calibrated to its μ at 1 m/s and this Δt."""
+    """The setup with another friction law in all its contacts; the PBFD laws are calibrated to its μ at 1 m/s and this Δt.
+    Raises `InputError` where there is no contact."""
+    if choice is not None and not any(isinstance(term, Contact) for term in setup.scene.terms):
+        raise InputError(f"--friction is {choice.value}, but nothing can touch in '{setup.scene.name}': leave it out")
     if choice is None or choice is Friction.COULOMB:
         return setup
     terms = [

@@ -11,7 +11,7 @@ from pbfd_torch.errors import InputError
 @dataclass(frozen=True)
 class HalfSpace:
     """All points p with normal · p < offset [m]. `normal` points out of the obstacle and is scaled to unit length.
-    `friction`, `group`, `mask` and `priority` as in `Collider`."""
+    `friction`, `group`, `mask`, `priority` and `frictionless` as in `Collider`."""
 
     name: str = "ground"
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -20,6 +20,7 @@ class HalfSpace:
     group: int = 1
     mask: int = 1
     priority: int = 0
+    frictionless: bool = False
 
     def __post_init__(self) -> None:
         length = math.hypot(*self.normal)

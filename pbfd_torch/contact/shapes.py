@@ -133,7 +133,8 @@ class ConvexHull:
 class Collider:
     """A shape on a link. `friction`: Coulomb's μ of its surface; `margin` [m]: skin around the shape in which the force sets
     in already. Two colliders touch where (`group` of one) & (`mask` of the other) ≠ 0 in either direction; the larger
-    `priority` decides μ, and at equal priority the larger μ does (MuJoCo's rules)."""
+    `priority` decides μ, and at equal priority the larger μ does; `frictionless`: there is no friction where this collider
+    decides, or where the other one is frictionless too (MuJoCo's rules)."""
 
     name: str
     link: str
@@ -145,6 +146,7 @@ class Collider:
     group: int = 1
     mask: int = 1
     priority: int = 0
+    frictionless: bool = False
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.friction) and self.friction >= 0):

@@ -41,7 +41,7 @@ def load_robot(
     if root != "mujoco":
         raise ModelError(f"root element is <{root}>: must be <robot> (URDF) or <mujoco> (MJCF)", file=str(file))
     if free_base is not None:
-        raise InputError(f"free_base is {free_base}: an MJCF file says itself what is free (<freejoint/>), leave it None")
+        raise InputError(f"free_base is {free_base}: an MJCF file says itself what is free (<freejoint/>), leave it out")
     return load_mjcf(file, dtype=dtype, device=device)
 
 

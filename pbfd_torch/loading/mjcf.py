@@ -26,7 +26,7 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
     """Loads an MJCF file: q and v have the layout of MuJoCo's qpos and qvel.
 
     Geoms that can collide become colliders, planes fixed to the world become obstacles, meshes become their convex hulls. A
-    geom with condim 1 has no friction. Numbers of MuJoCo's own method (time step, integrator, solver, solref, solimp, margin)
+    geom with condim 1 is frictionless. Numbers of MuJoCo's own method (time step, integrator, solver, solref, solimp, margin)
     are not read. Raises `ModelError` with MuJoCo's own words, or naming the element that cannot be used.
     """
     model = compile_mjcf(Path(path))

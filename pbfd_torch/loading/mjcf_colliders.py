@@ -80,10 +80,6 @@ def _shape(model: CompiledModel, g: int, losses: HullLosses) -> Shape | None:
     return None
 
 
-def _friction(model: CompiledModel, g: int) -> float:
-    return 0.0 if model.data.geom_condim[g] == 1 else float(model.data.geom_friction[g, 0])
-
-
 def _collider(model: CompiledModel, g: int, shape: Shape, planes: list[int]) -> Collider:
     m = model.data
     explicit = sum(1 << (_PAIR_BIT + k) for k, plane in enumerate(planes) if {(g, plane), (plane, g)} & _pairs(model))
@@ -93,10 +89,11 @@ def _collider(model: CompiledModel, g: int, shape: Shape, planes: list[int]) -> 
         shape=shape,
         position=tuple(m.geom_pos[g].tolist()),
         quaternion=tuple(m.geom_quat[g].tolist()),
-        friction=_friction(model, g),
+        friction=float(m.geom_friction[g, 0]),
         group=int(m.geom_contype[g]) | explicit,
         mask=int(m.geom_conaffinity[g]),
         priority=int(m.geom_priority[g]),
+        frictionless=bool(m.geom_condim[g] == 1),
     )
 
 
@@ -108,8 +105,9 @@ def _half_space(model: CompiledModel, g: int, pair_bit: int) -> HalfSpace:
         name=model.geom(g),
         normal=tuple(normal.tolist()),
         offset=float(normal @ model.placed.geom_xpos[g]),
-        friction=_friction(model, g),
+        friction=float(m.geom_friction[g, 0]),
         group=int(m.geom_contype[g]),
         mask=int(m.geom_conaffinity[g]) | pair_bit,
         priority=int(m.geom_priority[g]),
+        frictionless=bool(m.geom_condim[g] == 1),
     )

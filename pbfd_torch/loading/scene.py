@@ -44,10 +44,10 @@ def touch(a: Collider | HalfSpace, b: Collider | HalfSpace) -> bool:
 
 
 def friction_between(a: Collider | HalfSpace, b: Collider | HalfSpace) -> float:
-    """μ of a pair: that of the higher priority, else the larger one (MuJoCo's rule)."""
-    if a.priority != b.priority:
-        return (a if a.priority > b.priority else b).friction
-    return max(a.friction, b.friction)
+    """μ of a pair: that of the higher priority, else the larger one; 0 where all that decide are frictionless (MuJoCo's rule)."""
+    highest = max(a.priority, b.priority)
+    deciding = [x for x in (a, b) if x.priority == highest]
+    return 0.0 if all(x.frictionless for x in deciding) else max(x.friction for x in deciding)
 
 
 def ground_below(robot: Robot) -> HalfSpace:
