@@ -3,8 +3,8 @@
     python benchmarks/slope_drop.py [--duration 5] [--json]
 
 Error: the Coulomb margin (0: friction as Coulomb's law has it, < 0: too much), the deepest penetration, the largest gain of energy.
-Speed: wall milliseconds per simulated second of one world. MuJoCo gets spheres of the chain's radius where our chain has points with a
-skin of that radius.
+Speed: wall milliseconds per simulated second of one world. MuJoCo gets spheres of the chain's radius where our chain has points
+with a skin of that radius.
 """
 
 from __future__ import annotations

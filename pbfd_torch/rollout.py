@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,15 +109,17 @@ class Rollout:
                 meta = json.loads(str(file["meta"]))
                 if meta.get("format") != FORMAT:
                     raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
-                arrays: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
+                fields: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
+                fields |= {name: tuple(map(str, meta[name])) for name in ("link_names", "joint_names")}
+                return Rollout(scene_name=str(meta["scene_name"]), dt=float(meta["dt"]), **fields)
         except FileNotFoundError as error:
             raise InputError(f"no rollout at '{path}'") from error
-        except (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            if isinstance(error, InputError):
-                raise
+        except InputError:
+            raise
+        except _UNREADABLE as error:
             raise InputError(f"'{path}' is not a readable rollout: {error}") from error
-        texts: dict[str, Any] = {key: tuple(meta[key]) for key in ("link_names", "joint_names")}
-        return Rollout(scene_name=meta["scene_name"], dt=float(meta["dt"]), **texts, **arrays)
 
 
+# what numpy and zipfile raise on damaged files, and what a foreign `meta` leads to
+_UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 _ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]

@@ -23,6 +23,7 @@ from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.continuation import Continuation
 from pbfd_torch.solvers.objective import Objective, Solution
 from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Conservative, Term
 
 
@@ -55,6 +56,8 @@ class Scene:
 
     def __post_init__(self) -> None:
         a = self.articulation
+        if not any(isinstance(term, Inertia) for term in self.terms):
+            raise InputError("terms hold no Inertia(): nothing would resist the forces")
         if self.gravity.shape[-1:] != (3,) or not bool(torch.isfinite(self.gravity).all()):
             raise InputError(f"gravity is {self.gravity.tolist()}: must be finite with last dimension 3")
         if self.gravity.dtype != a.dtype or self.gravity.device != a.device:
@@ -160,9 +163,8 @@ class Simulator:
     ) -> Rollout:
         """Steps from `state` and records everything.
 
-         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every
-             step with the
-        number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
+        controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
+        with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
         count = self._count(controls, steps)
         recorder = Recorder(self.scene, self.integrator, self.dt, state)
         try:
@@ -181,8 +183,8 @@ class Simulator:
             if steps is None or steps < 1:
                 raise InputError(f"steps is {steps}: must be ≥ 1 where there are no controls")
             return steps
-        if controls.ndim < 2 or controls.shape[-1] != self.scene.nu:
-            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps, *batch, {self.scene.nu}]")
+        if controls.ndim < 2 or controls.shape[-1] != self.scene.nu or len(controls) == 0:
+            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps ≥ 1, *batch, {self.scene.nu}]")
         if steps is not None and steps != len(controls):
             raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
         return len(controls)

@@ -59,7 +59,9 @@ def on_ground(
 
 def at(height: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tensor:
     """Configuration of a free body over the origin, turned by a rotation vector."""
-    return torch.cat((torch.tensor((0.0, 0.0, height)).double(), quaternion_exp(torch.tensor(turn, dtype=torch.float64))))
+    return torch.cat(
+        (torch.tensor((0.0, 0.0, height), dtype=torch.float64), quaternion_exp(torch.tensor(turn, dtype=torch.float64)))
+    )
 
 
 def on_world(kind: JointKind, mass: float, terms: Sequence[Term] = (), gravity: Tensor | None = None, arm: float = 0.0) -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -14,14 +15,14 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
-from pbfd_torch.dynamics import center_of_mass
+from pbfd_torch.dynamics import bias_force, center_of_mass, mass_matrix
 from pbfd_torch.kinematics import place
 from pbfd_torch.models.boxes import box_slide, box_slope, stack
 from pbfd_torch.models.chains import chain_free, chain_ground, chain_heavy, chain_slope, chain_slope_drop
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix, rotation_log
+from pbfd_torch.rotations import quaternion_matrix, rotation_log
 from pbfd_torch.simulator import Scene, Simulator
 from pbfd_torch.solvers.jtj_lm import JtjLm
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -31,7 +32,6 @@ from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
-from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from tests.bodies import GRAVITY, at, box_inertia, diagonal, down, free_body, on_ground, on_world, rises, rolled_out
@@ -57,7 +57,7 @@ def metric(setup: Setup, rollout: Rollout, name: str) -> list[float]:
 @pytest.mark.parametrize("turn", [0.01, 0.3, 1.0])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_rotation_oracle(seed: int, turn: float) -> None:
-    """One implicit-Euler step of a free body without potential: the minimiser of Eq. 5 is R = polar((2R_n − R_{n−1}) J), J = ∫ρ x xᵀ about
+    """One implicit-Euler step of a free body without potential: Eq. 5 is least at R = polar((2R_n − R_{n−1}) J), J = ∫ρ x xᵀ about
     the centre of mass, which itself goes straight on, c = 2c_n − c_{n−1}: to 1e-12. The COM is not at the link's origin."""
     random = generator(seed)
     rows = random_inertia(random, 1.7)
@@ -96,8 +96,8 @@ def test_projectile(dt: float) -> None:
 
 @pytest.mark.parametrize("turn", [0.05, 0.5, 1.5])
 def test_spin_down_of_the_scheme(turn: float) -> None:
-    """About a principal axis the paper's integrator slows a spin by Δ' = atan2(sin Δ, 2 − cos Δ), Δ the turn per step: energy is lost at
-    order Δt, and nothing else happens."""
+    """About a principal axis the paper's integrator slows a spin by Δ' = atan2(sin Δ, 2 − cos Δ), Δ the turn per step: energy is
+    lost at order Δt, and nothing else happens."""
     articulation = free_body(1.0, diagonal(0.1, 0.2, 0.25))
     scene = Scene(articulation, (Inertia(),), torch.zeros(3, dtype=torch.float64))
     v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn / 0.05], dtype=torch.float64)
@@ -133,7 +133,7 @@ def test_linear_momentum_under_internal_torques() -> None:
 
 
 def test_dzhanibekov() -> None:
-    """A T-shaped body turning about its middle axis, no force: the COM stays (drift < 1e-3 m, here < 1e-12) and energy never rises."""
+    """A T-shaped body turning about its middle axis, no force: the COM stays (drift < 1e-12 m) and energy never rises."""
     setup = dzhanibekov()
     rollout = run(setup, 1 / 240, 1.5)
     assert bool(rollout.solved.all())
@@ -142,7 +142,7 @@ def test_dzhanibekov() -> None:
 
 
 def test_tumbling_box() -> None:
-    """Half sizes .1, .2, .3 m, ω = (1, 2, 3) rad/s, Δt .01: energy never rises, and the angular momentum keeps its direction's sign."""
+    """Half sizes .1, .2, .3 m, ω = (1, 2, 3) rad/s, Δt .01: energy never rises, the angular momentum keeps its direction."""
     half = (0.1, 0.2, 0.3)
     scene = Scene(free_body(1.0, box_inertia(1.0, half)), (Inertia(),), torch.zeros(3, dtype=torch.float64))
     rollout = rolled_out(scene, 0.01, 2.0, at(0.0), torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 3.0], dtype=torch.float64))
@@ -156,20 +156,20 @@ def test_tumbling_box() -> None:
 
 
 def test_pendulum_order() -> None:
-    """θ'' = −m g l sin θ/(I + m l²) from .5 rad: the error after 1 s halves with Δt, ratio 2 ± .4 (implicit Euler is of first order)."""
+    """θ'' = −m g l sin θ/(I + m l²) from .5 rad: the error after 1 s halves with Δt, ratio 2 ± .4 (first order)."""
     arm, mass = 0.4, 1.5
     scene = on_world(JointKind.HINGE, mass, gravity=down(), arm=arm)
     rate = mass * GRAVITY * arm / (0.02 + mass * arm**2)
     exact = solve_ivp(lambda _, y: [y[1], -rate * math.sin(y[0])], (0.0, 1.0), [0.5, 0.0], rtol=1e-12, atol=1e-13).y[0, -1]
     start = torch.tensor([0.5], dtype=torch.float64)
     errors = [float(rolled_out(scene, dt, 1.0, start).q[-1, 0]) - exact for dt in (0.02, 0.01, 0.005, 0.0025)]
-    ratios = [a / b for a, b in zip(errors[:-1], errors[1:], strict=True)]
+    ratios = [a / b for a, b in itertools.pairwise(errors)]
     assert ratios == pytest.approx([2.0] * 3, abs=0.4)
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.1])
 def test_mass_spring_damper_armature(dt: float) -> None:
-    """A slide obeys implicit Euler's recursion to rounding: (m + a)(x' − 2x + x_{−1})/Δt² + c (x' − x)/Δt + k (x' − x_r) = m g_x."""
+    """A slide obeys implicit Euler's recursion: (m + a)(x' − 2x + x_{−1})/Δt² + c (x' − x)/Δt + k (x' − x_r) = m g_x."""
     mass, armature, damping, stiffness, rest = 2.0, 0.7, 3.0, 50.0, 0.2
     gravity = torch.tensor([4.0, 0.0, -9.81], dtype=torch.float64)
 
@@ -191,7 +191,7 @@ def test_mass_spring_damper_armature(dt: float) -> None:
 
 @pytest.mark.parametrize("dt", [0.01, 0.05])
 def test_dry_friction_stops_a_joint(dt: float) -> None:
-    """A force τ against the motion stops mass m after v²m/(2τ), to .5 %, and holds it: then nothing moves by more than the creep."""
+    """A force τ against the motion stops mass m after v²m/(2τ), to .5 %, and holds it; it never turns back."""
     mass, torque, speed = 2.0, 3.0, 1.0
     dry = JointDryFriction(torch.tensor([torque], dtype=torch.float64), 1e-4)
     scene = on_world(JointKind.SLIDE, mass, (dry,))
@@ -240,8 +240,8 @@ def test_arm_thrown_at_its_limit(dt: float) -> None:
 @pytest.mark.parametrize("dt", [0.01, 0.1])
 @pytest.mark.parametrize("start", [1.2, -2.5])
 def test_arm_that_starts_outside_its_limit(dt: float, start: float) -> None:
-    """It recovers without NaN: every step solved, the violation never grows by more than it started with, and it ends within the range
-    or resting on a limit."""
+    """It recovers without NaN: every step solved, the violation is never larger than at the start, and at the end the arm is
+    within its range or nearly so."""
     rollout = rolled_out(_limited(-1.0, 0.5), dt, 3.0, torch.tensor([start], dtype=torch.float64))
     assert bool(rollout.solved.all())
     assert bool(torch.isfinite(rollout.q).all())
@@ -314,8 +314,8 @@ def test_boxes_side_by_side_stay() -> None:
 
 @pytest.mark.parametrize("dt", [0.01, 0.02, 0.05, 0.1])
 def test_inelastic_drop(dt: float) -> None:
-    """Boxes, flat and tilted, from .5 m: the centre never rises again by more than 1 % of the drop height, energy never rises, and they end
-    flat or on an edge at rest; every step solved."""
+    """Boxes, flat and tilted, from .5 m: the centre never rises again by more than 1 % of the drop height, energy never rises, and
+    they end flat and at rest; every step solved."""
     scene = on_ground(free_body(1.0, box_inertia(1.0, HALF)), Box(HALF), STIFF, CoulombFriction(0.5))
     q = torch.stack([at(0.65), at(0.65, (0.3, 0.2, 0.0)), at(0.65, (0.7, 0.5, 0.1))])
     rollout = rolled_out(scene, dt, 1.2, q)
@@ -360,8 +360,8 @@ def test_rod_pushed_into_the_ground() -> None:
 
 @pytest.mark.parametrize(("dt", "tolerance"), [(0.02, 5e-3), (0.05, 1e-2)])
 def test_stopping_distance(dt: float, tolerance: float) -> None:
-    """A box slides v_0²/(2μg): to .5 % at Δt .02 for every μ, to 1 % at Δt .05 where stopping takes at least four steps; then it rests at
-    less than 1e-3 m/s."""
+    """A box slides v_0²/(2μg): to .5 % at Δt .02 for every μ, to 1 % at Δt .05 where stopping takes at least four steps; then it
+    rests at less than 1e-3 m/s."""
     setup = box_slide()
     rollout = run(setup, dt, 1.5)
     assert bool(rollout.solved.all())
@@ -390,7 +390,7 @@ def test_slope_at_the_edge_of_the_cone(dt: float) -> None:
 
 
 def test_creep_under_a_part_of_the_cone() -> None:
-    """Held at a share of the cone a box creeps at v* = ε_v (1 − √(1 − share)), which for small loads is ε_v W/(2μN): 10 s at Δt .05."""
+    """Held at a share of the cone a box creeps at v* = ε_v (1 − √(1 − share)), for small loads ε_v W/(2μN): 10 s at Δt .05."""
     mu = 0.5
     share = torch.tensor([0.05, 0.25, 0.5, 0.9], dtype=torch.float64)
     slope = torch.atan(share * mu)
@@ -474,7 +474,7 @@ def test_distance_falls_with_the_papers_friction(law: str) -> None:
 
 
 def test_chain_slides_down_a_slope() -> None:
-    """Laid straight on 30°, μ .3: slides ½ g (sin − μ cos) T² in T = 10 s at Δt .05, to 1e-6 relative; margin of Coulomb's law 0."""
+    """Laid straight on 30°, μ .3: slides ½ g (sin − μ cos) T² in T = 10 s at Δt .05, to 1e-6 relative, at Coulomb's bound."""
     setup = chain_slope()
     rollout = run(setup, 0.05, 10.0)
     exact = 0.5 * GRAVITY * (math.sin(math.radians(30)) - 0.3 * math.cos(math.radians(30))) * 100.0
@@ -518,7 +518,7 @@ def test_contact_forces_carry_the_weight() -> None:
     momentum = rollout.linear_momentum.diff(dim=0) / 0.02
     force = rollout.contact_force.sum(-2) + mass * setup.scene.gravity
     assert float((momentum - force).abs().max()) <= 1e-6 * mass * GRAVITY
-    assert float(rollout.contact_force.abs().max()) > mass * GRAVITY
+    assert float(rollout.contact_force.sum(-2)[..., 2].max()) > 0.8 * mass * GRAVITY
 
 
 def test_friction_cone_and_complementarity() -> None:
@@ -535,7 +535,7 @@ def test_friction_cone_and_complementarity() -> None:
 
 def test_velocity_is_the_rate_of_the_poses() -> None:
     """v_{n+1} = (θ_{n+1} ⊖ θ_n)/Δt (Eq. 3): hinge rates are differences of angles, spins are logarithms of the links' rotations."""
-    rollout = run(chain_ground(), 0.02, 0.6)
+    rollout = run(chain_slope_drop(), 0.02, 0.4)
     angles = rollout.q[:, 0, 7:]
     torch.testing.assert_close(rollout.v[1:, 0, 6:], angles.diff(dim=0) / 0.02, rtol=0, atol=1e-10)
     turns = rollout.link_poses[:, 0, 0, :, :3]
@@ -546,8 +546,6 @@ def test_velocity_is_the_rate_of_the_poses() -> None:
 
 def test_time_step_convergence_of_a_fall() -> None:
     """The tip of a double pendulum after .5 s converges at first order to scipy's solution of M(q) v̇ + h(q, v) = 0."""
-    from pbfd_torch.dynamics import bias_force, mass_matrix
-
     y = (0.0, 1.0, 0.0)
     rows = diagonal(0.003, 0.004, 0.005)
     links = [
@@ -564,7 +562,7 @@ def test_time_step_convergence_of_a_fall() -> None:
     ]
     articulation = Articulation.from_links(links)
 
-    def rate(_: float, state: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def rate(_: float, state: np.ndarray) -> np.ndarray:
         q, v = torch.tensor(state[:2]), torch.tensor(state[2:])
         acceleration = torch.linalg.solve(mass_matrix(articulation, q), -bias_force(articulation, q, v, down()))
         return np.concatenate((state[2:], acceleration.numpy()))
@@ -589,14 +587,10 @@ def test_far_from_the_origin() -> None:
     torch.testing.assert_close(moved, here.q, rtol=0, atol=1e-6)
 
 
-def test_terms_work_on_any_quaternion_sign() -> None:
-    """q and −q of a quaternion are one rotation: the same rollout, to 1e-12."""
-    setup = chain_ground()
+def test_sign_of_quaternions_does_not_matter() -> None:
+    """q and −q of a quaternion are one rotation: the same rollout, to 1e-9."""
+    setup = chain_slope_drop()
     flipped = setup.q.clone()
     flipped[:, 3:7] *= -1
-    one, other = run(setup, 0.05, 0.6), run(dataclasses.replace(setup, q=flipped), 0.05, 0.6)
+    one, other = run(setup, 0.05, 0.5), run(dataclasses.replace(setup, q=flipped), 0.05, 0.5)
     torch.testing.assert_close(one.link_poses, other.link_poses, rtol=0, atol=1e-9)
-    turn = quaternion_exp(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
-    assert torch.equal(quaternion_matrix(turn), quaternion_matrix(-turn))
-    terms: list[Term] = list(setup.scene.terms)
-    assert len(terms) == 2
