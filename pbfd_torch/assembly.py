@@ -66,7 +66,7 @@ def assemble(placement: Placement, loads: Sequence[Load]) -> Balance:
     first = moment[..., :3][..., t.dof_joint, :, :]
     force = moment[..., 3][..., t.dof_joint, :]
     trace = first.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    turned = (first.mT @ omega[..., None]).squeeze(-1) - trace * omega - torch.linalg.cross(force, v)  # ω part of B s_j
+    turned = (first.mT @ omega[..., None]).squeeze(-1) - trace * omega - torch.linalg.cross(*torch.broadcast_tensors(force, v))
     curved = t.curvature_weight.to(axes.dtype) * (omega @ turned.mT)
 
     for load in loads:

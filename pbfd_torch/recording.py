@@ -26,13 +26,13 @@ class Recorder:
         self._scene, self._integrator, self._dt = scene, integrator, dt
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0
-        self._add_state(state)
+        self._add(**self._state(state))
 
     def _add(self, **entries: Tensor) -> None:
         for name, value in entries.items():
             self._entries.setdefault(name, []).append(value)
 
-    def _add_state(self, state: State) -> None:
+    def _state(self, state: State) -> dict[str, Tensor]:
         scene = self._scene
         a = scene.articulation
         dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
@@ -40,36 +40,34 @@ class Recorder:
         placement = place(a, state.q)
         rates = self._integrator.pose_rates(a, state, dt)
         linear, angular = momentum(placement, rates)
-        self._add(
-            q=state.q,
-            v=v,
-            link_poses=placement.poses[..., :3, :],
-            center_of_mass=center_of_mass(placement),
-            kinetic_energy=kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
-            potential_energy=scene.potential_energy(placement),
-            linear_momentum=linear,
-            angular_momentum=angular,
-        )
+        return {
+            "q": state.q,
+            "v": v,
+            "link_poses": placement.poses[..., :3, :],
+            "center_of_mass": center_of_mass(placement),
+            "kinetic_energy": kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
+            "potential_energy": scene.potential_energy(placement),
+            "linear_momentum": linear,
+            "angular_momentum": angular,
+        }
 
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
         """One solved step: the state after it, how it was solved, and its contacts."""
-        self._add_state(state)
-        self._add(
-            status=solution.status,
-            iterations=solution.iterations,
-            evaluations=solution.evaluations,
-            residual_norm=solution.residual_norm,
-        )
+        entries = self._state(state) | {
+            "status": solution.status,
+            "iterations": solution.iterations,
+            "evaluations": solution.evaluations,
+            "residual_norm": solution.residual_norm,
+        }
         pairs = zip(objective.terms, objective.prepared, strict=True)
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact)]
         placement = place(self._scene.articulation, state.q)
         points = [term.points(prepared, placement) for term, prepared in contacts]
         if points:
-            self._add(
-                contact_point=torch.cat([x.point for x in points], -2),
-                contact_depth=torch.cat([x.depth for x in points], -1),
-                contact_force=torch.cat([x.force for x in points], -2),
-            )
+            entries["contact_point"] = torch.cat([x.point for x in points], -2)
+            entries["contact_depth"] = torch.cat([x.depth for x in points], -1)
+            entries["contact_force"] = torch.cat([x.force for x in points], -2)
+        self._add(**entries)  # all at once, at the end: an interruption before this leaves the record as it was
         self.steps += 1
 
     def finish(self) -> Rollout:

@@ -107,17 +107,20 @@ class Simulator:
         self.integrator = integrator or ImplicitEuler()
         self.solver: Solver = solver or Continuation()
         self._dt = torch.tensor(dt, dtype=a.dtype, device=a.device)
+        parameters = (scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
+        self._batch = torch.broadcast_shapes(*parameters)
         self._scale = force_scale(a, float(torch.linalg.vector_norm(scene.gravity, dim=-1).max()))
 
     def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> State:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).
+        One configuration goes to all worlds where the velocity, gravity or the articulation's parameters have several.
 
         The start is of second order: the acceleration comes from a trial step, so stiff contacts are felt as they will be. A world
         whose trial step does not solve starts at first order. Raises `InputError` for wrong shapes, dtypes, devices or NaN."""
         a = self.scene.articulation
         q = a.rest if q is None else self._checked(q, a.nq, "q")
         v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
-        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1])
+        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
         q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
         q = a.topology.normalized(q)
         still = self.integrator.start(a, q, v, torch.zeros_like(v), self._dt)

@@ -244,6 +244,16 @@ def test_free_body_by_hand() -> None:
     torch.testing.assert_close(angular, quaternion_matrix(q[3:]) @ inertia @ v[3:], rtol=1e-12, atol=1e-12)
 
 
+def test_one_configuration_with_many_masses() -> None:
+    """q `[nq]` with pseudo-inertia `[3, nlink, 4, 4]` gives three mass matrices, proportional to the masses."""
+    articulation = random_tree(2)
+    q = random_q(articulation, 2)
+    scale = torch.tensor([1.0, 2.0, 5.0], dtype=torch.float64)
+    heavier = dataclasses.replace(articulation, pseudo_inertia=scale[:, None, None, None] * articulation.pseudo_inertia)
+    matrices = mass_matrix(heavier, q)
+    torch.testing.assert_close(matrices, scale[:, None, None] * mass_matrix(articulation, q), rtol=1e-13, atol=1e-13)
+
+
 def test_parameters_carry_gradients() -> None:
     """∂M/∂(mass scale) = M: inverse dynamics is linear in the pseudo-inertias, and they carry gradients."""
     articulation = random_tree(0)

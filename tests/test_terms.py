@@ -425,6 +425,17 @@ def test_pbfd_friction_is_coulombs_with_a_calibrated_mu(beta: float, printed: bo
         assert float(points.force[0, 0]) == pytest.approx(-mu * normal, rel=1e-12)
 
 
+@pytest.mark.parametrize("beta", [1.0, 2.0])
+@pytest.mark.parametrize("printed", [True, False], ids=["as printed", "as derived"])
+def test_calibrated_friction_brakes_with_mu(beta: float, printed: bool) -> None:
+    """`calibrated(μ, C⊥, v, Δt)`: at slip v Δt the law brakes with μN exactly, at any depth."""
+    law = (PbfdFriction.as_printed if printed else PbfdFriction.as_derived)(1.0, beta, 1.0).calibrated(0.35, 1e6, 0.7, 0.02)
+    articulation, made = one_body(Point(), law, 1e6)
+    for depth in (1e-4, 1e-2):
+        points, _ = contact_points(articulation, made, pose((0.0, 0.0, 0.0)), pose((0.0, 0.7 * 0.02, -depth)), 0.02)
+        assert float(points.force[0, 1]) == pytest.approx(-0.35 * 1e6 * depth**2, rel=1e-12)
+
+
 @pytest.mark.parametrize("angle", [1e-6, 0.01, 0.5, 2.0, 3.1])
 @pytest.mark.parametrize("direction", [0.0, 0.8])
 def test_pure_rolling_does_not_slip(angle: float, direction: float) -> None:
