@@ -14,16 +14,16 @@ from pbfd_torch.rotations import log_jacobian_symmetric
 from pbfd_torch.terms.load import JointLoad, StepContext
 
 
-def checked_coefficient(articulation: Articulation, value: Tensor, what: str, *, isotropic: bool = True) -> Tensor:
-    """`value` `[*, nv]` as the articulation's dtype; raises `InputError` unless it is finite, ≥ 0 and, where `isotropic`, the same
-    about all three axes of a ball or free joint's rotation."""
+def checked_coefficient(articulation: Articulation, value: Tensor, what: str) -> Tensor:
+    """`value` `[*, nv]` as the articulation's dtype; raises `InputError` unless it is finite, ≥ 0 and the same about all three axes of
+    a ball or free joint's rotation."""
     value = torch.as_tensor(value, dtype=articulation.dtype, device=articulation.device)
     if value.ndim == 0 or value.shape[-1] != articulation.nv:
         raise InputError(f"{what} has shape {tuple(value.shape)}: must end in ({articulation.nv},)")
     if not bool((torch.isfinite(value) & (value >= 0)).all()):
         raise InputError(f"{what} is {value.tolist()}: must be finite and ≥ 0")
     turning = value[..., articulation.topology.turning_v]
-    if isotropic and not bool((turning == turning[..., :1]).all()):
+    if not bool((turning == turning[..., :1]).all()):
         raise InputError(f"{what} of a ball or free joint differs between its rotation axes: must be equal for all three")
     return value
 
