@@ -122,9 +122,9 @@ def actuators(s: Situation) -> Actuators:
         [
             Actuator.motor("motor", names[0], gear=2.0),
             Actuator.motor("weak motor", names[1], effort=1e-3),
-            Actuator.position("position", names[2], kp=30.0, kv=2.0),
+            Actuator("position", names[2], gear=-1.5, gain=30.0, bias=0.2, stiffness=30.0, damping=2.0),
             Actuator.position("weak position", names[3], kp=3000.0, kv=20.0, effort=0.1),
-            Actuator.velocity("velocity", names[0], kv=4.0),
+            Actuator("velocity", names[0], gear=0.5, gain=4.0, damping=4.0),
             Actuator.velocity("weak velocity", names[4], kv=400.0, effort=0.1),
         ],
     )

@@ -323,6 +323,7 @@ BAD_INPUT: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "worlds 0": ((*BOX, "--worlds", 0), ("--worlds is 0: must be ≥ 1",)),
     "worlds -3": ((*BOX, "--worlds", -3), ("--worlds is -3: must be ≥ 1",)),
     "worlds of a file 0": (("simulate", HOPPER, "--worlds", 0), ("--worlds is 0: must be ≥ 1",)),
+    "threads 0": ((*BOX, "--threads", 0), ("--threads is 0: must be ≥ 1",)),
     "dt 0": ((*BOX, "--dt", 0), ("--dt is 0.0 s: must be > 0",)),
     "dt < 0": ((*BOX, "--dt", -0.02), ("--dt is -0.02 s: must be > 0",)),
     "dt > duration": ((*BOX, "--dt", 2), ("--dt is 2.0 s: must be > 0 and at most the duration, 1.5 s",)),

@@ -123,6 +123,16 @@ def test_unsolvable_problems_say_so(solver: Solver, function: Callable[[Tensor],
 
 
 @all_solvers
+def test_infinite_residuals_are_never_accepted(solver: Solver) -> None:
+    """The first full step from 0 along r = −1/|1 − q| lands on the pole, where r pushes on with infinite force: refused; the point
+    returned has a finite residual."""
+    solution = solver.solve(scalar_objective(lambda q: -1 / (1 - q).abs()), torch.zeros(1, dtype=torch.float64))
+    assert not bool(solution.solved)
+    assert bool(torch.isfinite(solution.residual_norm))
+    assert float(solution.q) < 1.0
+
+
+@all_solvers
 def test_unsolvable_world_harms_no_other(solver: Solver) -> None:
     """q³ = c with one world at c = NaN: that world is NON_FINITE, and the others come out bitwise as in a batch without it."""
     guess = torch.tensor([[3.0], [2.0], [5.0]], dtype=torch.float64)

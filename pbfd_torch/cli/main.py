@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, SolverChoice, load_setup
+from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, SolverChoice, load_setup, use_threads
 from pbfd_torch.errors import NotModelledWarning, PbfdError
 
 app = typer.Typer(
@@ -36,6 +36,7 @@ def simulate(
     friction: Annotated[Friction | None, typer.Option(help="Friction law; default: the scene's (Coulomb).")] = None,
     dtype: Annotated[Dtype, typer.Option(help="Floating-point type.")] = Dtype.FLOAT64,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.CPU,
+    threads: Annotated[int, typer.Option(help="CPU threads; more than one pays for large batches on idle cores only.")] = 1,
     seed: Annotated[int | None, typer.Option(help="Give all worlds but the first small random extra velocities.")] = None,
     fixed_base: Annotated[
         bool | None,
@@ -50,6 +51,7 @@ def simulate(
     """Simulates a scene or a robot file and reports how it went."""
     from pbfd_torch.cli.simulate import run
 
+    use_threads(threads)
     choices = Choices(integrator, solver, friction, dtype, device, seed, None if fixed_base is None else not fixed_base, keyframe)
     raise typer.Exit(run(load_setup(scene, worlds, choices), choices, duration, dt, out, as_json))
 

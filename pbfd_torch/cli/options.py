@@ -69,6 +69,14 @@ class Choices:
         return Continuation() if self.solver is SolverChoice.JTJ_LM else JtjLm()
 
 
+def use_threads(count: int) -> None:
+    """Lets PyTorch use `count` CPU threads. Its default, one per core, makes the factorisation of many small matrices up to 20
+    times slower where another process uses a core."""
+    if count < 1:
+        raise InputError(f"--threads is {count}: must be ≥ 1")
+    torch.set_num_threads(count)
+
+
 def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
     """The named scene or the file, in the wanted number of worlds, on the wanted device. Raises `InputError` or `ModelError`."""
     if worlds is not None and worlds < 1:

@@ -15,8 +15,8 @@ from pbfd_torch.terms.load import JointLoad, StepContext
 
 
 def checked_coefficient(articulation: Articulation, value: Tensor, what: str) -> Tensor:
-    """`value` `[*, nv]` as the articulation's dtype; raises `InputError` unless it is finite, ≥ 0 and the same about all three axes of
-    a ball or free joint's rotation."""
+    """`value` `[*, nv]` as the articulation's dtype; raises `InputError` unless it is finite, ≥ 0 and the same about all three axes
+    of a ball or free joint's rotation."""
     value = torch.as_tensor(value, dtype=articulation.dtype, device=articulation.device)
     if value.ndim == 0 or value.shape[-1] != articulation.nv:
         raise InputError(f"{what} has shape {tuple(value.shape)}: must end in ({articulation.nv},)")
