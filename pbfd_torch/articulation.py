@@ -244,10 +244,11 @@ class Articulation:
         return frame, frame @ torch.where(hinge, turn, shift), frame @ torch.where(hinge, turn2, torch.zeros_like(turn2))
 
 
-def force_scale(articulation: Articulation, gravity: float) -> Tensor:
+def force_scale(articulation: Articulation, gravity: float | Tensor) -> Tensor:
     """Size `[*, nv]` of a force that counts as one: the weight [N] for translations, weight × reach [N m] for rotations, with
-    gravity [m/s²] taken as at least 1, so that weightless scenes have a scale too."""
-    weight = articulation.mass.sum(-1, keepdim=True) * max(gravity, 1.0)
+    gravity [m/s²] (one number or `[*batch]`) taken as at least 1, so that weightless scenes have a scale too."""
+    strength = torch.as_tensor(gravity, dtype=articulation.dtype, device=articulation.device).clamp_min(1.0)
+    weight = articulation.mass.sum(-1, keepdim=True) * strength[..., None]
     lever = torch.where(articulation.topology.turns, reach(articulation)[..., None], 1.0)
     return (weight * lever).detach()
 

@@ -109,7 +109,7 @@ class Simulator:
         self._dt = torch.tensor(dt, dtype=a.dtype, device=a.device)
         parameters = (scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
         self._batch = torch.broadcast_shapes(*parameters)
-        self._scale = force_scale(a, float(torch.linalg.vector_norm(scene.gravity, dim=-1).max()))
+        self._scale = force_scale(a, torch.linalg.vector_norm(scene.gravity, dim=-1))
 
     def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> State:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).

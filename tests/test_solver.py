@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -333,6 +334,20 @@ def test_world_with_its_own_parameters_equals_the_world_alone(dtype: torch.dtype
         single = box_slide(k + 1, dtype)
         _, some = run(Simulator(single.scene, 0.02), single.q, single.v, 20)
         assert torch.equal(some.q[:, k], whole.q[:, k])
+
+
+@both_dtypes
+def test_world_with_its_own_gravity_equals_the_world_alone(dtype: torch.dtype) -> None:
+    """A world on the moon is bitwise the same beside a world on Jupiter as alone: no tolerance is shared between worlds."""
+    setup = chain_ground(2, dtype)
+    q, v = scattered(setup, 7)
+    q[:, 2] -= 0.3
+    gravity = torch.stack((0.17 * setup.scene.gravity, 2.5 * setup.scene.gravity))
+    _, whole = run(Simulator(dataclasses.replace(setup.scene, gravity=gravity), 0.02, solver=HASTY), q, v, 10)
+    for k in range(2):
+        scene = dataclasses.replace(setup.scene, gravity=gravity[k])
+        _, alone = run(Simulator(scene, 0.02, solver=HASTY), q[k], v[k], 10)
+        assert_same(whole, (slice(None), k), alone)
 
 
 @both_dtypes
