@@ -24,8 +24,9 @@ from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
-from pbfd_torch.terms.joint_springs import Armature
+from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from tests.bodies import GRAVITY, at, diagonal, down, free_body, on_ground, on_world, rises, rolled_out
@@ -217,7 +218,7 @@ BAD_PARAMETERS: dict[str, tuple[Callable[[], object], str]] = {
     "exponent 1": (lambda: NormalForce(1e6, 1.0), "exponent α is 1.0: must be > 1"),
     "exponent NaN": (lambda: NormalForce(1e6, math.nan), "exponent α is nan"),
     "weight 0": (lambda: NormalForce.for_weight(0.0), "weight is 0.0"),
-    "penetration 0": (lambda: NormalForce.for_weight(1.0, 0.0), "penetration 0.0"),
+    "penetration 0": (lambda: NormalForce.for_weight(1.0, 0.0), "penetration is 0.0 m"),
     "mu < 0": (lambda: CoulombFriction(-0.1), "mu is -0.1"),
     "mu NaN": (lambda: CoulombFriction(doubles(0.1, math.nan)), "mu is .*nan"),
     "slip speed 0": (lambda: CoulombFriction(0.5, 0.0), "slip_speed is 0.0 m/s: must be > 0"),
@@ -238,6 +239,14 @@ BAD_PARAMETERS: dict[str, tuple[Callable[[], object], str]] = {
     "flat hull": (lambda: ConvexHull(np.zeros((3, 3))), "hull vertices"),
     "collider margin < 0": (lambda: Collider("c", "body", Sphere(0.1), margin=-0.1), "margin of collider 'c'"),
     "collider friction < 0": (lambda: Collider("c", "body", Sphere(0.1), friction=-0.1), "friction of collider 'c'"),
+    "limit stiffness 0": (lambda: JointLimits(doubles(1.0, 0.0)), "limit stiffness is .*0.0.*> 0"),
+    "negative damping": (lambda: JointDamping(doubles(-1.0)), "joint damping is .*-1.0"),
+    "negative armature": (lambda: Armature(doubles(-1.0)), "armature is .*-1.0"),
+    "negative spring": (lambda: JointSprings(doubles(-1.0), doubles(0.0)), "spring stiffness is .*-1.0"),
+    "negative dry friction": (lambda: JointDryFriction(doubles(-1.0)), "dry friction torque is .*-1.0"),
+    "dry friction slip speed 0": (lambda: JointDryFriction(doubles(1.0), 0.0), "slip_speed is 0.0"),
+    "effort < 0": (lambda: arm(Actuator.motor("m", "joint", effort=-1.0)), "actuator 'm': force_range"),
+    "effort NaN": (lambda: arm(Actuator.motor("m", "joint", effort=math.nan)), "actuator 'm': force_range"),
     "violation 0": (lambda: JointLimits.for_articulation(ball().articulation, violation=0.0), "violation is 0.0"),
     "float16": (lambda: ball().articulation.to(torch.float16), "torch.float16: must be torch.float32 or torch.float64"),
     "link name": (lambda: ball().articulation.link_index("hand"), "no link named 'hand': the links are body"),
@@ -255,7 +264,7 @@ BAD_PARAMETERS: dict[str, tuple[Callable[[], object], str]] = {
         "actuator 'm': joint 'free' must be a hinge or a slide",
     ),
     "actuator on no joint": (lambda: arm(Actuator.motor("m", "wrist")), "no joint named 'wrist'"),
-    "actuator stiffness < 0": (lambda: arm(Actuator.position("p", "joint", kp=-1.0)), "actuator 'p': stiffness -1.0"),
+    "actuator stiffness < 0": (lambda: arm(Actuator.position("p", "joint", kp=-1.0)), "actuator 'p': stiffness is -1.0"),
 }
 
 
@@ -661,3 +670,11 @@ def test_single_precision(dt: float) -> None:
     if dt == 0.02:
         exact = rolled_out(double.scene, dt, 0.6, double.q, double.v)
         assert float((rough.center_of_mass - exact.center_of_mass).abs().max()) <= 1e-3
+
+
+def test_friction_of_the_wrong_length() -> None:
+    """A μ per candidate must fit the number of candidates: the message says how many there are."""
+    scene = chain_ground().scene
+    (contact,) = [term for term in scene.terms if isinstance(term, Contact)]
+    with pytest.raises(InputError, match=r"20 candidates"):
+        dataclasses.replace(contact, friction=CoulombFriction(torch.full((7,), 0.5, dtype=torch.float64)))

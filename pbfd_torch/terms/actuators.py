@@ -14,6 +14,7 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation, JointKind
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
 
 
@@ -81,8 +82,12 @@ class Actuators:
             j = articulation.joint_index(a.joint)
             if t.joint_sizes[j] != (JointKind.HINGE.nq, JointKind.HINGE.nv):
                 raise InputError(f"actuator '{a.name}': joint '{a.joint}' must be a hinge or a slide")
-            if a.stiffness < 0 or a.damping < 0:
-                raise InputError(f"actuator '{a.name}': stiffness {a.stiffness} and damping {a.damping} must be ≥ 0")
+            for what in ("stiffness", "damping"):
+                require_non_negative(f"actuator '{a.name}': {what}", getattr(a, what))
+            for what in ("control_range", "force_range"):
+                low, high = getattr(a, what)
+                if not low <= high:
+                    raise InputError(f"actuator '{a.name}': {what} is ({low}, {high}): must rise")
         joints = [articulation.joint_index(a.joint) for a in actuators]
 
         def tensor(values: Sequence[object]) -> Tensor:

@@ -119,6 +119,17 @@ class Contact:
             names=tuple(names),
         )
 
+    def __post_init__(self) -> None:
+        zero = torch.zeros_like(self.radius)[None]
+        try:
+            if self.friction is not None:
+                self.friction.force(zero, zero, zero, zero[..., None].expand(-1, -1, 3), torch.ones_like(zero))
+        except RuntimeError as error:
+            raise InputError(
+                f"a parameter of the friction law does not fit the {len(self.radius)} candidates: must be one number or end in "
+                f"({len(self.radius)},): {error}"
+            ) from error
+
     @cached_property
     def rounded(self) -> bool:
         """Whether any candidate has a radius, so that rolling matters."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.errors import InputError
+from pbfd_torch.terms.checks import require_non_negative, require_positive
 
 
 def slip_factor(size: Tensor, width: Tensor) -> tuple[Tensor, Tensor]:
@@ -34,17 +33,15 @@ class CoulombFriction:
     """f∥ = −μ N s(‖u‖) u (METHOD §4): the dry friction law, smooth below the slip speed ε_v.
 
     `mu`: coefficient ≥ 0, one number or one per candidate `[*, npoint]` (MuJoCo's rule for two surfaces: the larger one).
-    `slip_speed`: ε_v [m/s] > 0; under a tangential load W a sticking contact creeps at ε_v W/(2 μ N)."""
+    `slip_speed`: ε_v [m/s] > 0; under a tangential load W a sticking contact creeps at ε_v (1 − √(1 − W/(μN))),
+    which is ε_v W/(2μN) while W is small."""
 
     mu: float | Tensor
     slip_speed: float = 1e-3
 
     def __post_init__(self) -> None:
-        mu = torch.as_tensor(self.mu)
-        if not bool((torch.isfinite(mu) & (mu >= 0)).all()):
-            raise InputError(f"mu is {mu.tolist()}: must be finite and ≥ 0")
-        if not (math.isfinite(self.slip_speed) and self.slip_speed > 0):
-            raise InputError(f"slip_speed is {self.slip_speed} m/s: must be > 0 and finite")
+        require_non_negative("mu", self.mu)
+        require_positive("slip_speed", self.slip_speed, "m/s")
 
     def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Friction force and its derivatives by depth and by slip: `[*, n, 3]`, `[*, n, 3]`, `[*, n, 3, 3]`.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.checks import require_non_negative, require_positive
 from pbfd_torch.terms.coulomb_friction import slip_factor
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 
@@ -24,6 +25,10 @@ class JointDryFriction:
 
     torque: Tensor
     slip_speed: float = 1e-3
+
+    def __post_init__(self) -> None:
+        require_non_negative("dry friction torque", self.torque)
+        require_positive("slip_speed", self.slip_speed, "rad/s or m/s")
 
     def prepare(self, step: StepContext) -> PreparedDryFriction:
         t = step.previous.articulation.topology

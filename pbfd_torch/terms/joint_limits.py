@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, force_scale
-from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 
 
@@ -20,12 +19,14 @@ class JointLimits:
 
     stiffness: Tensor
 
+    def __post_init__(self) -> None:
+        require_positive("limit stiffness", self.stiffness)
+
     @staticmethod
     def for_articulation(articulation: Articulation, gravity: float = 9.81, violation: float = 2e-3) -> JointLimits:
         """Stiffness for which the whole weight (m g for a slide, m g · reach for a hinge) rests `violation` [rad or m] past a
         limit. Reach: see `articulation.reach`. Raises `InputError` for a violation ≤ 0."""
-        if not (math.isfinite(violation) and violation > 0):
-            raise InputError(f"violation is {violation}: must be > 0 and finite")
+        require_positive("violation", violation, "rad or m")
         return JointLimits(force_scale(articulation, gravity) / violation**2)
 
     def prepare(self, step: StepContext) -> None:

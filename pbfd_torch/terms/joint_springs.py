@@ -11,6 +11,7 @@ from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement, difference
 from pbfd_torch.rotations import log_jacobian_symmetric
+from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
 
 
@@ -20,8 +21,7 @@ def checked_coefficient(articulation: Articulation, value: Tensor, what: str) ->
     value = torch.as_tensor(value, dtype=articulation.dtype, device=articulation.device)
     if value.ndim == 0 or value.shape[-1] != articulation.nv:
         raise InputError(f"{what} has shape {tuple(value.shape)}: must end in ({articulation.nv},)")
-    if not bool((torch.isfinite(value) & (value >= 0)).all()):
-        raise InputError(f"{what} is {value.tolist()}: must be finite and ≥ 0")
+    require_non_negative(what, value)
     turning = value[..., articulation.topology.turning_v]
     if not bool((turning == turning[..., :1]).all()):
         raise InputError(f"{what} of a ball or free joint differs between its rotation axes: must be equal for all three")
@@ -66,6 +66,9 @@ class JointSprings(_Pull):
     stiffness: Tensor
     rest: Tensor
 
+    def __post_init__(self) -> None:
+        require_non_negative("spring stiffness", self.stiffness)
+
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.stiffness, self.rest)
 
@@ -80,6 +83,9 @@ class JointDamping(_Pull):
 
     damping: Tensor
 
+    def __post_init__(self) -> None:
+        require_non_negative("joint damping", self.damping)
+
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.damping / step.dt[..., None], step.previous.q)
 
@@ -90,6 +96,9 @@ class Armature(_Pull):
     [kg m² or kg] ≥ 0; pulled to the integrator's target configuration as links are to their target poses."""
 
     inertia: Tensor
+
+    def __post_init__(self) -> None:
+        require_non_negative("armature", self.inertia)
 
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.inertia * step.weight[..., None], step.target_q)

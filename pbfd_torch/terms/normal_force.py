@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.terms.checks import require_positive
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
@@ -35,17 +36,15 @@ class NormalForce:
     exponent: float = 2.0
 
     def __post_init__(self) -> None:
-        stiffness = torch.as_tensor(self.stiffness)
-        if not bool((torch.isfinite(stiffness) & (stiffness > 0)).all()):
-            raise InputError(f"stiffness is {stiffness.tolist()} N/m^α: must be finite and > 0")
+        require_positive("stiffness", self.stiffness, "N/m^α")
         if not (math.isfinite(self.exponent) and self.exponent > 1):
             raise InputError(f"exponent α is {self.exponent}: must be > 1 and finite, or the residual is not smooth")
 
     @staticmethod
     def for_weight(weight: float, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:
         """The stiffness at which a load `weight` [N] on one point rests `penetration` [m] deep."""
-        if not (math.isfinite(weight) and weight > 0 and math.isfinite(penetration) and penetration > 0):
-            raise InputError(f"weight is {weight} N and penetration {penetration} m: must be > 0 and finite")
+        require_positive("weight", weight, "N")
+        require_positive("penetration", penetration, "m")
         return NormalForce(weight / penetration**exponent, exponent)
 
     def _coefficient(self, depth: Tensor) -> float | Tensor:

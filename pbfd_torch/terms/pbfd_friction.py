@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.coulomb_friction import isotropic_slope
 from pbfd_torch.terms.normal_force import power
 
@@ -28,9 +29,7 @@ class PbfdFriction:
     slip_exponent: float
 
     def __post_init__(self) -> None:
-        stiffness = torch.as_tensor(self.stiffness)
-        if not bool((torch.isfinite(stiffness) & (stiffness >= 0)).all()):
-            raise InputError(f"C∥ is {stiffness.tolist()}: must be finite and ≥ 0")
+        require_non_negative("C∥", self.stiffness)
         if not (self.beta > 0 and self.gamma > 0 and math.isfinite(self.beta + self.gamma)):
             raise InputError(f"β is {self.beta} and γ is {self.gamma}: must be > 0 and finite")
         if not (math.isfinite(self.slip_exponent) and self.slip_exponent >= 0):

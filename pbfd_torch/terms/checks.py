@@ -1,0 +1,22 @@
+"""Checks of parameters at construction: a bad one is refused with a message that names it, its value and its range."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+
+
+def require_non_negative(what: str, value: float | Tensor, unit: str = "") -> None:
+    """Raises `InputError` unless every entry is finite and ≥ 0."""
+    entries = torch.as_tensor(value)
+    if not bool((torch.isfinite(entries) & (entries >= 0)).all()):
+        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be ≥ 0 and finite")
+
+
+def require_positive(what: str, value: float | Tensor, unit: str = "") -> None:
+    """Raises `InputError` unless every entry is finite and > 0."""
+    entries = torch.as_tensor(value)
+    if not bool((torch.isfinite(entries) & (entries > 0)).all()):
+        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be > 0 and finite")
