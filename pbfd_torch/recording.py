@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
-from pbfd_torch.kinematics import place
+from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.objective import Solution
@@ -26,18 +26,17 @@ class Recorder:
         self._scene, self._integrator, self._dt = scene, integrator, dt
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0
-        self._add(**self._state(state))
+        self._add(**self._state(state, place(scene.articulation, state.q)))
 
     def _add(self, **entries: Tensor) -> None:
         for name, value in entries.items():
             self._entries.setdefault(name, []).append(value)
 
-    def _state(self, state: State) -> dict[str, Tensor]:
+    def _state(self, state: State, placement: Placement) -> dict[str, Tensor]:
         scene = self._scene
         a = scene.articulation
         dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
         v = self._integrator.velocity(a, state, dt)
-        placement = place(a, state.q)
         rates = self._integrator.pose_rates(a, state, dt)
         linear, angular = momentum(placement, rates)
         return {
@@ -53,7 +52,8 @@ class Recorder:
 
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
         """One solved step: the state after it, how it was solved, and its contacts."""
-        entries = self._state(state) | {
+        placement = place(self._scene.articulation, state.q)
+        entries = self._state(state, placement) | {
             "status": solution.status,
             "iterations": solution.iterations,
             "evaluations": solution.evaluations,
@@ -61,7 +61,6 @@ class Recorder:
         }
         pairs = zip(objective.terms, objective.prepared, strict=True)
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact)]
-        placement = place(self._scene.articulation, state.q)
         points = [term.points(prepared, placement) for term, prepared in contacts]
         if points:
             entries["contact_point"] = torch.cat([x.point for x in points], -2)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.solvers.objective import Status
+from pbfd_torch.solvers.objective import is_solved
 
 FORMAT = "pbfd_torch rollout 1"
 
@@ -82,7 +82,7 @@ class Rollout:
     @property
     def solved(self) -> Tensor:
         """`[T, *batch]` bool."""
-        return self.status <= int(Status.CONTINUED)
+        return is_solved(self.status)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all.

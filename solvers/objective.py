@@ -19,6 +19,11 @@ class Status(enum.IntEnum):
     NON_FINITE = 4  # NaN or infinity in the guess or in the residual there
 
 
+def is_solved(status: Tensor) -> Tensor:
+    """Which of the statuses, values of `Status`, are those of a solved world; bool, same shape."""
+    return status <= int(Status.CONTINUED)
+
+
 class Evaluation(Protocol):
     """Values at one point, for every world of the batch."""
 
@@ -87,4 +92,4 @@ class Solution:
     @property
     def solved(self) -> Tensor:
         """`[*batch]` bool."""
-        return self.status <= int(Status.CONTINUED)
+        return is_solved(self.status)

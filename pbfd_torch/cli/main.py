@@ -1,4 +1,4 @@
-"""The `pbfd` command: simulate, info, demo."""
+"""The `pbfd` command: simulate, info, scenes, demo."""
 
 from __future__ import annotations
 

@@ -57,6 +57,7 @@ class PreparedActuators:
     drive: Tensor  # gain·u + bias
     inverse_dt: Tensor
     previous: Tensor  # x_n
+    spread: Tensor  # [nu, nv] 1 where the actuator drives the degree of freedom (several may drive one)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,8 @@ class Actuators:
             control = step.control
         low, high = self.control_range.unbind(-1)
         drive = self.gain * torch.maximum(torch.minimum(control, high), low) + self.bias
-        return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate])
+        spread = (self.dof[:, None] == torch.arange(step.previous.articulation.nv, device=self.dof.device)).to(self.gear.dtype)
+        return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate], spread)
 
     def load(self, prepared: PreparedActuators, placement: Placement) -> JointLoad:
         x = self.gear * placement.q[..., self.coordinate]
@@ -142,12 +144,6 @@ class Actuators:
         inside = (force > low) & (force < high)
         force = torch.maximum(torch.minimum(force, high), low)
         slope = torch.where(inside, self.stiffness + damping, torch.zeros_like(force)) * self.gear * self.gear
-        spread = self._spread(placement)
+        spread = prepared.spread.expand(*placement.q.shape[:-1], *prepared.spread.shape)
         residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
         return JointLoad(residual, torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
-
-    def _spread(self, placement: Placement) -> Tensor:
-        """`[*batch, nu, nv]` 1 where the actuator drives the degree of freedom (several may drive one)."""
-        nv = placement.articulation.nv
-        spread = torch.nn.functional.one_hot(self.dof, nv).to(placement.q.dtype)
-        return spread.expand(*placement.q.shape[:-1], self.nu, nv)

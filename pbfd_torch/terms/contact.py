@@ -40,6 +40,7 @@ class PreparedContact:
     dt: Tensor  # [*batch, 1]
     centers: Tensor  # [*batch, npoint, 3] at the start of the step
     rotations: Tensor  # [*batch, nlink, 3, 3] at the start of the step
+    on_link: Tensor  # [nlink, npoint] 1 where the candidate is the link's
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,16 +136,15 @@ class Contact:
         """Whether any candidate has a radius, so that rolling matters."""
         return bool((self.radius > 0).any())
 
-    def _on_link(self, nlink: int) -> Tensor:
-        """`[nlink, npoint]` 1 where the candidate is the link's."""
-        return torch.nn.functional.one_hot(self.link, nlink).T.to(self.radius.dtype)
-
     def _centers(self, placement: Placement) -> Tensor:
         poses = placement.poses[..., self.link, :3, :]
         return (poses[..., :3] @ self.position[..., None]).squeeze(-1) + poses[..., 3]
 
     def prepare(self, step: StepContext) -> PreparedContact:
-        return PreparedContact(step.dt[..., None], self._centers(step.previous), step.previous.poses[..., :3, :3])
+        poses = step.previous.poses
+        links = torch.arange(poses.shape[-3], device=self.link.device)
+        on_link = (links[:, None] == self.link).to(self.radius.dtype)
+        return PreparedContact(step.dt[..., None], self._centers(step.previous), poses[..., :3, :3], on_link)
 
     def _depth(self, centers: Tensor) -> Tensor:
         return self.radius + self.margin + self.offset[..., None] - (centers @ self.normal[..., None]).squeeze(-1)
@@ -197,8 +197,7 @@ class Contact:
             trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
             twisted = twisted - pull + trace * torch.eye(3, dtype=pull.dtype, device=pull.device)
 
-        on_link = self._on_link(placement.poses.shape[-3])
-        on_link = on_link.expand(*force.shape[:-2], *on_link.shape)
+        on_link = prepared.on_link.expand(*force.shape[:-2], *prepared.on_link.shape)
 
         def summed(blocks: Tensor) -> Tensor:
             return (on_link @ blocks.flatten(-2)).unflatten(-1, (3, 3))
