@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.rotations import quaternion_matrix, skew
 from pbfd_torch.topology import Topology
+from pbfd_torch.worlds import Worlds, replaced
 
 
 class JointKind(enum.Enum):
@@ -135,9 +137,15 @@ class Articulation:
         numeric = {f.name: getattr(self, f.name).to(where, dtype) for f in dataclasses.fields(self) if f.name != "topology"}
         return dataclasses.replace(self, topology=self.topology.to(where), **numeric)
 
-    def __post_init__(self) -> None:
+    def take(self, worlds: Worlds) -> Self:
+        """The same tree with the values of some worlds."""
+        return replaced(self, **{name: worlds.pick(getattr(self, name), len(shape)) for name, shape in self._shapes.items()})
+
+    @property
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """Of the numeric fields, without their batch dimensions."""
         t = self.topology
-        shapes = {
+        return {
             "joint_frame": (t.njoint, 4, 4),
             "joint_axis": (t.njoint, 3),
             "joint_ref": (t.njoint,),
@@ -147,7 +155,9 @@ class Articulation:
             "upper": (t.nv,),
             "rest": (t.nq,),
         }
-        for name, shape in shapes.items():
+
+    def __post_init__(self) -> None:
+        for name, shape in self._shapes.items():
             value: Tensor = getattr(self, name)
             if tuple(value.shape[value.ndim - len(shape) :]) != shape:
                 raise InputError(f"{name} has shape {tuple(value.shape)}: must end in {shape}")

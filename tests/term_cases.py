@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance, assemble
+from pbfd_torch.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
@@ -51,7 +51,7 @@ class Situation:
         """Residual and Jacobian of the terms alone: a link load of zero goes with them, as the assembly needs one."""
         context, placement = self.context(q), place(self.articulation, q)
         loads = [term.load(term.prepare(context), placement) for term in terms]
-        return assemble(placement, [no_load(placement), *loads])
+        return Balance(placement, [no_load(placement), *loads])
 
 
 def no_load(placement: Placement) -> LinkLoad:

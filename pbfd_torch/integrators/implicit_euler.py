@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.kinematics import difference, place, retract
 from pbfd_torch.terms.load import StepContext
+from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +20,10 @@ class State:
 
     q: Tensor
     q_previous: Tensor
+
+    def take(self, worlds: Worlds) -> Self:
+        """The state of some worlds."""
+        return replaced(self, q=worlds.pick(self.q, 1), q_previous=worlds.pick(self.q_previous, 1))
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,11 @@ class ImplicitEuler:
             target_q=retract(articulation, state.q, difference(articulation, state.q_previous, state.q)),
             control=control,
         )
+
+    def resized(self, articulation: Articulation, state: State, dt: Tensor, new: Tensor) -> State:
+        """The state as seen by steps of another length: at the same place with the same velocity."""
+        v = self.velocity(articulation, state, dt)
+        return self.start(articulation, state.q, v, torch.zeros_like(v), new)
 
     def advance(self, state: State, q: Tensor) -> State:
         """The state after a step that ended at q."""

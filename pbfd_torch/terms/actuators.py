@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
+from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,19 @@ class Actuators:
         }
         return dataclasses.replace(self, **moved)
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same actuators with the values of some worlds."""
+        return replaced(
+            self,
+            gear=worlds.pick(self.gear, 1),
+            gain=worlds.pick(self.gain, 1),
+            bias=worlds.pick(self.bias, 1),
+            stiffness=worlds.pick(self.stiffness, 1),
+            damping=worlds.pick(self.damping, 1),
+            control_range=worlds.pick(self.control_range, 2),
+            force_range=worlds.pick(self.force_range, 2),
+        )
+
     def prepare(self, step: StepContext) -> PreparedActuators:
         if step.control is None:
             control = self.gain.new_zeros(self.nu)
@@ -131,8 +145,7 @@ class Actuators:
             raise InputError(f"control has shape {tuple(step.control.shape)}: must end in ({self.nu},)")
         else:
             control = step.control
-        low, high = self.control_range.unbind(-1)
-        drive = self.gain * torch.maximum(torch.minimum(control, high), low) + self.bias
+        drive = self.gain * _clamped(control, self.control_range) + self.bias
         spread = (self.dof[:, None] == torch.arange(step.previous.articulation.nv, device=self.dof.device)).to(self.gear.dtype)
         return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate], spread)
 
@@ -142,8 +155,27 @@ class Actuators:
         force = prepared.drive - self.stiffness * x - damping * (x - prepared.previous)
         low, high = self.force_range.unbind(-1)
         inside = (force > low) & (force < high)
-        force = torch.maximum(torch.minimum(force, high), low)
+        force = _clamped(force, self.force_range)
         slope = torch.where(inside, self.stiffness + damping, torch.zeros_like(force)) * self.gear * self.gear
         spread = prepared.spread.expand(*placement.q.shape[:-1], *prepared.spread.shape)
         residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
         return JointLoad(residual, torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
+
+    def energy(self, prepared: PreparedActuators, placement: Placement) -> Tensor:
+        """Minus the work of all actuators from x_n on, −Σ ∫ f dx [J] `[*batch]`. The force before its limits, F(x), falls in a
+        straight line of slope −g, g = stiffness + damping/Δt, and f = clamp(F): the integral over Δx = x − x_n is, with values at
+        x_n marked by a zero, ½ (f − f₀)(F − f + F₀ − f₀)/g − ½ (f + f₀) Δx. Without limits only the second part is left."""
+        moved = self.gear * placement.q[..., self.coordinate] - prepared.previous
+        slope = self.stiffness + self.damping * prepared.inverse_dt
+        first = prepared.drive - self.stiffness * prepared.previous
+        last = first - slope * moved
+        limited_first, limited_last = _clamped(first, self.force_range), _clamped(last, self.force_range)
+        safe = torch.where(slope > 0, slope, torch.ones_like(slope))  # where g = 0, f = f₀
+        beyond = (limited_last - limited_first) * (last - limited_last + first - limited_first) / safe
+        return 0.5 * (beyond - (limited_last + limited_first) * moved).sum(-1)
+
+
+def _clamped(value: Tensor, bounds: Tensor) -> Tensor:
+    """The value within bounds `[nu, 2]`."""
+    low, high = bounds.unbind(-1)
+    return torch.maximum(torch.minimum(value, high), low)

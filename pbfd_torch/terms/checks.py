@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,12 @@ def require_non_negative(what: str, value: float | Tensor, unit: str = "") -> No
     entries = torch.as_tensor(value)
     if not bool((torch.isfinite(entries) & (entries >= 0)).all()):
         raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be ≥ 0 and finite")
+
+
+def require_widening(factor: float) -> None:
+    """Raises `InputError` unless the factor of a range of slip speeds is finite and ≥ 1."""
+    if not (math.isfinite(factor) and factor >= 1):
+        raise InputError(f"widening factor is {factor}: must be ≥ 1 and finite")
 
 
 def require_positive(what: str, value: float | Tensor, unit: str = "") -> None:

@@ -11,7 +11,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -23,8 +23,10 @@ from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.rotations import log_jacobian_left, quaternion_matrix, rotation_log, skew
+from pbfd_torch.terms.lagged_friction import LaggedFriction, SlipLaw
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.worlds import Worlds, replaced
 
 
 class FrictionLaw(Protocol):
@@ -32,6 +34,10 @@ class FrictionLaw(Protocol):
 
     def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Force, d force/d depth, d force/d slip from N, dN/dd, d `[*, n]`, u `[*, n, 3]` and dt (broadcastable to `[*, n]`)."""
+        ...
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same law with the parameters of some worlds."""
         ...
 
 
@@ -146,6 +152,17 @@ class Contact:
         on_link = (links[:, None] == self.link).to(self.radius.dtype)
         return PreparedContact(step.dt[..., None], self._centers(step.previous), poses[..., :3, :3], on_link)
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same contact with the values of some worlds."""
+        return replaced(
+            self,
+            position=worlds.pick(self.position, 2),
+            normal=worlds.pick(self.normal, 1),
+            offset=worlds.pick(self.offset, 0),
+            normal_force=self.normal_force.take(worlds),
+            friction=None if self.friction is None else self.friction.take(worlds),
+        )
+
     def _depth(self, centers: Tensor) -> Tensor:
         return self.radius + self.margin + self.offset[..., None] - (centers @ self.normal[..., None]).squeeze(-1)
 
@@ -184,7 +201,7 @@ class Contact:
             tangential = drag_by_slip - _outer((drag_by_slip @ normal[..., None]).squeeze(-1), normal)
             arm = skew(centers)
             if self.rounded:
-                turning = skew(self.normal) @ log_jacobian_left(self._turn(prepared, placement))
+                turning = skew(self.normal)[..., None, :, :] @ log_jacobian_left(self._turn(prepared, placement))
                 arm = arm - self.radius[..., None, None] * turning[..., self.link, :, :]
             turned = _outer(by_depth, torch.linalg.cross(centers, normal)) + tangential @ arm
             shifted = _outer(by_depth, normal) - tangential
@@ -210,6 +227,36 @@ class Contact:
     def potential(self, placement: Placement) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
         return self.normal_force.energy(self.depth(placement)).sum(-1)
+
+    def energy(self, prepared: PreparedContact, placement: Placement) -> Tensor:
+        """Stored energy (Eq. 9) and, where the friction is lagged, its energy μ N̂ S(‖u‖) [J] `[*batch]`. Friction that follows
+        the normal force is the gradient of no scalar: it has no part in this."""
+        centers = self._centers(placement)
+        energy = self.normal_force.energy(self._depth(centers))
+        if isinstance(self.friction, LaggedFriction):
+            energy = energy + self.friction.energy(self._slip(prepared, placement, centers), prepared.dt)
+        return energy.sum(-1)
+
+    def lagged(self, prepared: PreparedContact, placement: Placement) -> Self:
+        """The same contact with its friction held at the normal forces and depths of `placement`; without friction, or with a law
+        that is no `SlipLaw`, the contact itself. What `softened` does later to C⊥ does not reach the held friction.
+
+        The load is then the gradient of `energy`, exactly for points. For rounded candidates it is not: friction f acts at c − ρn,
+        which moves by δc − ρ δω × n, while the slip takes φ and moves by δc − ρ (Lδω) × n, L = ∂φ/∂ω = 1 − ½[φ]× + …. The gradient
+        has the moment ρ (Lᵀ − 1)(n × f) more than the load, about ½ρ‖φ‖‖f‖ at most, and none where φ is along n × f (planar
+        rolling)."""
+        law = self.friction.law if isinstance(self.friction, LaggedFriction) else self.friction
+        if not isinstance(law, SlipLaw):
+            return self
+        depth = self.depth(placement)
+        normal, _ = self.normal_force.force(depth)
+        return replaced(self, friction=LaggedFriction(law, normal, depth))
+
+    def widened(self, factor: float) -> Self:
+        """The same contact with its friction smooth over a `factor` ≥ 1 times wider range of slip speeds, where the law has one."""
+        if not isinstance(self.friction, SlipLaw | LaggedFriction):
+            return self
+        return replaced(self, friction=self.friction.widened(factor))
 
     def softened(self, factor: float) -> Contact:
         """The same contact with C⊥ scaled by `factor`; the friction law follows the normal force."""

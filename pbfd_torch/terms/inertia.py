@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.rotations import skew
 from pbfd_torch.terms.load import LinkLoad, StepContext
+from pbfd_torch.worlds import Worlds
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,10 @@ class Inertia:
         weighted = (placement.poses @ (prepared.weight * placement.articulation.pseudo_inertia)).mT
         lag = (placement.poses - prepared.target)[..., :3, :]
         return LinkLoad(lag @ weighted, inertia_stiffness(placement.poses @ weighted))
+
+    def take(self, worlds: Worlds) -> Self:
+        """Itself: the masses are the articulation's."""
+        return self
 
     def energy(self, prepared: PreparedInertia, placement: Placement) -> Tensor:
         lag = (placement.poses - prepared.target)[..., :3, :]

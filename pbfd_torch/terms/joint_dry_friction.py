@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 from torch import Tensor
 
 from pbfd_torch.kinematics import Placement
-from pbfd_torch.terms.checks import require_non_negative, require_positive
-from pbfd_torch.terms.coulomb_friction import slip_factor
+from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
+from pbfd_torch.terms.coulomb_friction import slip_factor, slip_work
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
+from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedDryFriction:
     start: Tensor  # coordinates at the start of the step, [*batch, nv]
-    width: Tensor  # displacement [rad or m] over which the torque reaches its full size
+    dt: Tensor  # [*batch, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +36,36 @@ class JointDryFriction:
         t = step.previous.articulation.topology
         start = step.previous.q.new_zeros((*step.previous.q.shape[:-1], t.nv))
         start[..., t.scalar_v] = step.previous.q[..., t.scalar_q]
-        return PreparedDryFriction(start, self.slip_speed * step.dt[..., None])
+        return PreparedDryFriction(start, step.dt[..., None])
 
     def load(self, prepared: PreparedDryFriction, placement: Placement) -> JointLoad:
-        t = placement.articulation.topology
-        moved = -prepared.start
-        moved[..., t.scalar_v] = moved[..., t.scalar_v] + placement.q[..., t.scalar_q]
+        moved = _moved(prepared, placement)
         size = moved.abs()
-        factor, slope = slip_factor(size, prepared.width)
+        factor, slope = slip_factor(size, self.slip_speed * prepared.dt)
         return diagonal_load(self.torque * factor * moved, self.torque * (factor + slope * size))
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same friction with the torques of some worlds."""
+        return replaced(self, torque=worlds.pick(self.torque, 1))
+
+    def energy(self, prepared: PreparedDryFriction, placement: Placement) -> Tensor:
+        """Σ τ S(|Δq|) [J] `[*batch]`, S as in `slip_work`: what the friction takes from the step."""
+        size = _moved(prepared, placement).abs()
+        return (self.torque * slip_work(size, self.slip_speed * prepared.dt)).sum(-1)
+
+    def widened(self, factor: float) -> Self:
+        """The same torque, smooth below `factor` ≥ 1 times the slip speed."""
+        require_widening(factor)
+        return replaced(self, slip_speed=self.slip_speed * factor)
+
+    def lagged(self, prepared: PreparedDryFriction, placement: Placement) -> Self:
+        """Itself: its torque depends on no normal force."""
+        return self
+
+
+def _moved(prepared: PreparedDryFriction, placement: Placement) -> Tensor:
+    """Displacement of each hinge and slide over the step `[*batch, nv]`, 0 for other degrees of freedom."""
+    t = placement.articulation.topology
+    moved = -prepared.start
+    moved[..., t.scalar_v] = moved[..., t.scalar_v] + placement.q[..., t.scalar_q]
+    return moved

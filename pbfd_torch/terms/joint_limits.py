@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 from torch import Tensor
 
@@ -10,6 +11,7 @@ from pbfd_torch.articulation import Articulation, force_scale
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
+from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,14 @@ class JointLimits:
         below, above = _violations(placement)
         residual = self.stiffness * (above * above - below * below)
         return diagonal_load(residual, 2 * self.stiffness * (above + below))
+
+    def energy(self, prepared: None, placement: Placement) -> Tensor:
+        """The stored energy [J] `[*batch]`."""
+        return self.potential(placement)
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same limits with the stiffness of some worlds."""
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1))
 
     def softened(self, factor: float) -> JointLimits:
         """The same limits with stiffness scaled by `factor`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from pbfd_torch.kinematics import Placement, difference
 from pbfd_torch.rotations import log_jacobian_symmetric
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
+from pbfd_torch.worlds import Worlds, replaced
 
 
 def checked_coefficient(articulation: Articulation, value: Tensor, what: str) -> Tensor:
@@ -72,6 +74,10 @@ class JointSprings(_Pull):
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.stiffness, self.rest)
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same springs with the values of some worlds."""
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1), rest=worlds.pick(self.rest, 1))
+
     def potential(self, placement: Placement) -> Tensor:
         """Stored energy [J] `[*batch]`."""
         return self.energy(PreparedPull(self.stiffness, self.rest), placement)
@@ -89,6 +95,10 @@ class JointDamping(_Pull):
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.damping / step.dt[..., None], step.previous.q)
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same damping with the coefficients of some worlds."""
+        return replaced(self, damping=worlds.pick(self.damping, 1))
+
 
 @dataclass(frozen=True, eq=False)
 class Armature(_Pull):
@@ -102,3 +112,7 @@ class Armature(_Pull):
 
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.inertia * step.weight[..., None], step.target_q)
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same armature with the inertias of some worlds."""
+        return replaced(self, inertia=worlds.pick(self.inertia, 1))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.kinematics import Placement, place
+from pbfd_torch.worlds import Worlds
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,18 @@ class StepContext:
     target_poses: Tensor
     target_q: Tensor
     control: Tensor | None
+
+    def take(self, worlds: Worlds) -> StepContext:
+        """The step of some worlds."""
+        before = self.previous
+        return StepContext(
+            dt=worlds.pick(self.dt, 0),
+            previous=place(before.articulation.take(worlds), worlds.pick(before.q, 1)),
+            weight=worlds.pick(self.weight, 0),
+            target_poses=worlds.pick(self.target_poses, 3),
+            target_q=worlds.pick(self.target_q, 1),
+            control=None if self.control is None else worlds.pick(self.control, 1),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +80,10 @@ class Term(Protocol):
         """The load at a placement, and its stiffness; a pure function of its arguments."""
         ...
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same effect with the parameters of some worlds."""
+        ...
+
 
 @runtime_checkable
 class OneSided(Protocol):
@@ -83,6 +100,29 @@ class Conservative(Protocol):
 
     def potential(self, placement: Placement) -> Tensor:
         """Stored energy [J] `[*batch]`."""
+        ...
+
+
+@runtime_checkable
+class Potential(Protocol):
+    """A term whose load is the gradient of a scalar; that of a term with friction from a normal force only once it is lagged."""
+
+    def energy(self, prepared: Any, placement: Placement) -> Tensor:
+        """That scalar [J] `[*batch]` at a placement that ends the prepared step, up to a constant: a summand of E (Eq. 6)."""
+        ...
+
+
+@runtime_checkable
+class Frictional(Protocol):
+    """A term with dry friction."""
+
+    def widened(self, factor: float) -> Term:
+        """The same friction, smooth over a `factor` ≥ 1 times wider range of slip speeds; works with what the original prepared."""
+        ...
+
+    def lagged(self, prepared: Any, placement: Placement) -> Term:
+        """The same term with its friction held at the normal forces of this placement, which makes it a gradient; works with what
+        the original prepared."""
         ...
 
 

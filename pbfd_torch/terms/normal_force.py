@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.terms.checks import require_positive
+from pbfd_torch.worlds import Worlds, replaced
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
@@ -51,6 +53,11 @@ class NormalForce:
         if isinstance(self.stiffness, Tensor) and 0 < self.stiffness.ndim < depth.ndim:
             return self.stiffness[..., None]
         return self.stiffness
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same law with the stiffness of some worlds."""
+        per_candidate = isinstance(self.stiffness, Tensor) and self.stiffness.ndim > len(worlds.batch)
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1 if per_candidate else 0))
 
     def scaled(self, factor: float) -> NormalForce:
         """The same law with C⊥ scaled by `factor` > 0."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.terms.checks import require_non_negative
-from pbfd_torch.terms.coulomb_friction import isotropic_slope
+from pbfd_torch.terms.checks import require_non_negative, require_widening
+from pbfd_torch.terms.coulomb_friction import isotropic_slope, slip_size
 from pbfd_torch.terms.normal_force import power
+from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,14 @@ class PbfdFriction:
         share = (self.beta + 1) * (speed * dt) ** (self.slip_exponent + 1)
         return replace(self, stiffness=mu * normal_stiffness / share)
 
+    def take(self, worlds: Worlds) -> Self:
+        """The same law with the C∥ of some worlds."""
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1))
+
     def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Friction force and its derivatives by depth and by slip, shapes as in `CoulombFriction.force`."""
         d = depth.clamp_min(0)
-        size = torch.linalg.vector_norm(slip, dim=-1)
+        size = slip_size(slip)
         factor = power(size, self.slip_exponent)
         if self.slip_exponent > 0:  # slope/‖u‖ · u uᵀ vanishes at u = 0, where isotropic_slope guards the division
             safe = torch.where(size > 0, size, torch.ones_like(size))
@@ -69,3 +75,14 @@ class PbfdFriction:
         unit = factor[..., None] * slip
         by_slip = -weight[..., None, None] * isotropic_slope(slip, size, factor, slope)
         return -weight[..., None] * unit, -weight_slope[..., None] * unit, by_slip
+
+    def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
+        """C∥ (β + 1)/(e + 2) ‖u‖^{e+2} d^{γ+1} [J] `[*, n]`: minus its gradient by the slip, with d held still, is the force. With
+        e = β − 1 it is the density of Eq. 11 times C∥."""
+        weight = self.stiffness * (self.beta + 1) * power(depth.clamp_min(0), self.gamma + 1)
+        return weight * power(slip_size(slip), self.slip_exponent + 2) / (self.slip_exponent + 2)
+
+    def widened(self, factor: float) -> Self:
+        """Itself: this law has no slip speed below which it is smoothed."""
+        require_widening(factor)
+        return self

@@ -1,0 +1,50 @@
+"""Some worlds of a batch, and their parts of the objects that hold values per world."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar, overload
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Instance = TypeVar("Instance", bound="DataclassInstance")
+
+
+@dataclass(frozen=True, eq=False)
+class Worlds:
+    """Some worlds of a batch, as a flat list.
+
+    Attributes:
+        batch: the batch shape.
+        index: `[n]` long, their positions in the flattened batch.
+    """
+
+    batch: tuple[int, ...]
+    index: Tensor
+
+    @overload
+    def pick(self, value: Tensor, rank: int) -> Tensor: ...
+    @overload
+    def pick(self, value: float | Tensor, rank: int) -> float | Tensor: ...
+    def pick(self, value: float | Tensor, rank: int) -> float | Tensor:
+        """Rows `[n, *event]` of a value `[*, *event]` whose last `rank` dimensions are its own and whose leading ones broadcast to
+        the batch. A number, or a value without leading dimensions, is one for all worlds: it comes back itself."""
+        if not isinstance(value, Tensor) or value.ndim <= rank:
+            return value
+        event = value.shape[value.ndim - rank :]
+        return value.expand(*self.batch, *event).flatten(0, len(self.batch) - 1)[self.index]
+
+
+def replaced(instance: Instance, **changes: Any) -> Instance:
+    """A copy of a frozen dataclass with some fields changed: `__post_init__` does not run, its checks being done, and cached
+    properties are left behind. The instance itself where no field changes identity."""
+    if all(getattr(instance, name) is value for name, value in changes.items()):
+        return instance
+    fields = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+    copy = object.__new__(type(instance))
+    vars(copy).update(fields | changes)
+    return copy
