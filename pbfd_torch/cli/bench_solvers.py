@@ -1,0 +1,272 @@
+"""`pbfd bench solvers`: Fig. 4 and Table I of the paper, measured."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+from tqdm import tqdm
+
+from pbfd_torch.cli.options import Choices, load_setup, use_threads
+from pbfd_torch.errors import InputError
+from pbfd_torch.simulator import SHORTEST_STEP
+
+bench = typer.Typer(no_args_is_help=True, help="Measures what the library does against the paper's claims.")
+
+LONGEST_STEP = 0.1  # [s]: the paper's largest
+MOST_STEPS, MOST_WORLDS, MOST_REPEATS, MOST_DOFS = 10_000, 4096, 1000, 200
+FILES = ("solvers.json", "fig4.png", "table1.png")
+
+
+@bench.callback()
+def _group() -> None:
+    """Keeps `solvers` a command of its own while it is the only one."""
+
+
+@bench.command()
+def solvers(
+    out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-solvers"),
+    steps: Annotated[int, typer.Option(help="Fig. 4: steps of each chain.")] = 60,
+    dt: Annotated[float | None, typer.Option(help="Fig. 4: time step in seconds; default: each scene's.")] = None,
+    worlds: Annotated[int, typer.Option(help="Fig. 4: worlds in the batch, all but the first with small extra velocities.")] = 1,
+    seconds: Annotated[
+        float, typer.Option(help="Fig. 4: time for each case on each chain; slow ones get through fewer steps.")
+    ] = 12.0,
+    sizes: Annotated[str, typer.Option(help="Table I: degrees of freedom, separated by commas.")] = "5,10,20,40,80",
+    batch: Annotated[int, typer.Option(help="Table I: worlds in the batch, beside a single one.")] = 256,
+    repeats: Annotated[int, typer.Option(help="Times that a short measurement is repeated; the shortest counts.")] = 5,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
+) -> None:
+    """Compares LM, JTJ-LM and L-BFGS on E and GE with the default: Fig. 4 (iterations, time and error of every step of two chains)
+    and Table I (cost of each substep over the degrees of freedom). One thread, float64. Exit status 1: the default left a step
+    unsolved."""
+    counts = parsed_sizes(sizes)
+    check_count("--steps", steps, MOST_STEPS)
+    check_count("--worlds", worlds, MOST_WORLDS)
+    check_count("--batch", batch, MOST_WORLDS)
+    check_count("--repeats", repeats, MOST_REPEATS)
+    if dt is not None and not SHORTEST_STEP <= dt <= LONGEST_STEP:
+        raise InputError(f"--dt is {dt} s: must be from {SHORTEST_STEP:g} to {LONGEST_STEP:g}")
+    if not (math.isfinite(seconds) and seconds > 0):
+        raise InputError(f"--seconds is {seconds}: must be > 0 and finite")
+    check_folder(out)
+    use_threads(1)
+    report = measured(steps, dt, worlds, seconds, counts, batch, repeats)
+    write(report, out)
+    if as_json:
+        print(json.dumps(plain(report), allow_nan=False))
+    else:
+        print_report(report, out)
+    raise typer.Exit(min(1, sum(chain["cases"]["default"]["unsolved_steps"] for chain in report["figure_4"]["chains"].values())))
+
+
+def check_count(option: str, value: int, most: int) -> None:
+    """Raises `InputError` unless 1 ≤ value ≤ most."""
+    if not 1 <= value <= most:
+        raise InputError(f"{option} is {value}: must be from 1 to {most}")
+
+
+def parsed_sizes(text: str) -> list[int]:
+    """Ascending degrees of freedom. Raises `InputError` for what is no list of at least two different sizes."""
+    try:
+        found = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        found = []
+    if len(found) < 2 or found[0] < 2 or found[-1] > MOST_DOFS:
+        raise InputError(f"--sizes is '{text}': must be at least two different numbers from 2 to {MOST_DOFS}, such as 5,10,20")
+    return found
+
+
+def check_folder(folder: Path) -> None:
+    """Raises `InputError` now rather than after the measurement."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in FILES):
+        raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
+
+
+def measured(
+    steps: int, dt: float | None, worlds: int, seconds: float, sizes: Sequence[int], batch: int, repeats: int
+) -> dict[str, Any]:
+    """Everything that the command measures, as plain data; with a progress bar on a terminal."""
+    from pbfd_torch.bench import figure_4, table_1
+    from pbfd_torch.bench.timing import fit_sizes
+
+    started = time.perf_counter()
+    variants = table_1.variants(batch)
+    total = len(figure_4.CHAINS) * len(figure_4.CASES) * steps + len(variants) * table_1.units(sizes)
+    with tqdm(total=total, unit="measurement", disable=not sys.stderr.isatty(), leave=False) as bar:
+        chains = {}
+        for name in figure_4.CHAINS:
+            bar.set_description(name)
+            setup = load_setup(name, worlds, Choices(seed=0))
+            chains[name] = figure_4.measure_chain(setup, dt or setup.dt, steps, seconds, repeats, bar.update)
+        costs = {}
+        for variant in variants:
+            bar.set_description(f"Table I, {variant.key}")
+            costs[variant.key] = table_1.measure_variant(variant, sizes, repeats, bar.update)
+    return {
+        "wall_s": time.perf_counter() - started,
+        "environment": {
+            "pbfd_torch": _version(),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "machine": f"{platform.system()} {platform.machine()}",
+            "processor": _processor(),
+            "threads": torch.get_num_threads(),
+            "dtype": "float64",
+            "device": "cpu",
+        },
+        "figure_4": {"chains": chains, "seconds_per_case": seconds, "repeats": repeats, "notes": list(figure_4.NOTES)},
+        "table_1": {
+            "sizes": list(sizes),
+            "fit_sizes": fit_sizes(sizes),
+            "repeats": repeats,
+            "variants": costs,
+            "paper": {
+                case: dict(zip(("gradient", "hessian", "inversion", "total"), row.paper, strict=True))
+                | {"total_on_cpu": row.paper_cpu_total}
+                for case, row in table_1.ROWS.items()
+            },
+            "notes": list(table_1.NOTES),
+        },
+    }
+
+
+def _version() -> str | None:
+    """The installed version; None in a checkout that is not installed."""
+    try:
+        return importlib.metadata.version("pbfd_torch")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    """The CPU's name, where the system tells it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def plain(value: Any) -> Any:
+    """The same with None for NaN and infinity, which JSON lacks."""
+    if isinstance(value, dict):
+        return {key: plain(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [plain(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write(report: dict[str, Any], folder: Path) -> None:
+    """The three files. Raises `InputError` where they cannot be written."""
+    from pbfd_torch.bench.pictures import draw_figure_4, draw_table_1
+
+    table = report["table_1"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        draw_figure_4(report["figure_4"]["chains"], folder / FILES[1])
+        draw_table_1(table["sizes"], table["fit_sizes"], table["variants"], folder / FILES[2])
+    except OSError as error:
+        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+
+
+def print_report(report: dict[str, Any], folder: Path) -> None:
+    """Tables, notes, and where the files are."""
+    console = Console(markup=False, emoji=False)
+    about = report["environment"]
+    for name, chain in report["figure_4"]["chains"].items():
+        console.print(_figure_4_table(name, chain), "", sep="\n")
+    for note in report["figure_4"]["notes"]:
+        console.print(f"- {note}")
+    table = report["table_1"]
+    console.print("", _table_1_rows(table), "", sep="\n")
+    for title, found in table["variants"].items():
+        console.print(_substep_table(title, found, table["sizes"]), "", sep="\n")
+    for note in table["notes"]:
+        console.print(f"- {note}")
+    console.print(
+        f"\n{report['wall_s']:.0f} s; PyTorch {about['torch']}, {about['threads']} thread, {about['dtype']}, {about['processor']}"
+    )
+    print(f"written: {', '.join(str(folder / name) for name in FILES)}")
+
+
+def _table(title: str, *headers: str) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold cyan", padding=(0, 1, 0, 0), box=None)
+    for k, header in enumerate(headers):
+        table.add_column(header, justify="right" if k else "left", overflow="fold")
+    return table
+
+
+def _figure_4_table(name: str, chain: dict[str, Any]) -> Table:
+    table = _table(
+        f"Fig. 4, {name}: {chain['steps']} steps of {chain['dt']:g} s, worlds: {chain['worlds']}; reference solved to "
+        f"{_number(chain['reference_residual_norm_max'])}",
+        *("case", "budget", "failed\n/steps", "iterations\nmean/p95/max", "time [ms]\nmean/p95/max", "×\ndefault"),
+        *("largest\nresidual", "tip error\n[m]"),
+    )
+    for case, found in chain["cases"].items():
+        table.add_row(
+            case,
+            str(found["budget"] or ""),
+            f"{found['unsolved_steps']}/{found['measured_steps']}",
+            "/".join(_three_digits(found["iterations"][key]) for key in ("mean", "p95", "max")),
+            "/".join(_three_digits(found["time_ms"][key]) for key in ("mean", "p95", "max")),
+            _three_digits(found["time_of_default"]),
+            _number(found["residual_norm_max"]),
+            _number(found["tip_error_max_m"]),
+        )
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1e}"
+
+
+def _table_1_rows(table: dict[str, Any]) -> Table:
+    """The paper's Table I with our exponents: measured (paper)."""
+    from pbfd_torch.bench.table_1 import ROWS
+
+    fit, (title, found) = table["fit_sizes"], next(iter(table["variants"].items()))
+    result = _table(
+        f"Table I, {title}: exponents over n = {fit[0]} … {fit[-1]}, measured (paper)",
+        *("case", "gradient", "Hessian", "solve (paper: GPU)", "iteration (paper: GPU, CPU)"),
+    )
+    for case, row in ROWS.items():
+        parts = [
+            "/" if name is None else f"{found['substeps'][name]['exponent']:.1f} ({'/' if paper is None else paper})"
+            for name, paper in zip((row.gradient, row.hessian, row.solve), row.paper[:3], strict=True)
+        ]
+        result.add_row(case, *parts, f"{found['iterations'][case]['exponent']:.1f} ({row.paper[3]}, {row.paper_cpu_total})")
+    result.add_row("default", "", "", "", f"{found['iterations']['default']['exponent']:.1f}")
+    return result
+
+
+def _substep_table(title: str, found: dict[str, Any], sizes: Sequence[int]) -> Table:
+    columns = [f"n = {n}" for n in sizes]
+    result = _table(
+        f"{title} (autodiff: {found['worlds_of_autodiff']}): time per world [µs]", "substep", *columns, "exponent", "error"
+    )
+    for row in found["substeps"].values():
+        result.add_row(row["label"], *map(_three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", _number(row["error_max"]))
+    for case, row in found["iterations"].items():
+        result.add_row(f"iteration: {case}", *map(_three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", "")
+    return result
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"
