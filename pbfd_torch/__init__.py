@@ -5,18 +5,18 @@ from pbfd_torch.errors import InputError, ModelError, NotModelledWarning, PbfdEr
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Scene, Simulator
-from pbfd_torch.solvers.continuation import Continuation
-from pbfd_torch.solvers.jtj_lm import JtjLm
+from pbfd_torch.solvers.descent import Descent
+from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution, Status
 
 __all__ = [
     "Articulation",
-    "Continuation",
+    "Descent",
+    "Fallbacks",
     "ImplicitEuler",
     "InputError",
     "Joint",
     "JointKind",
-    "JtjLm",
     "Link",
     "ModelError",
     "NotModelledWarning",

@@ -8,7 +8,7 @@ A is how the forces answer a motion; B is how the motion axes turn under forces 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,19 +16,6 @@ from torch import Tensor
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.load import JointLoad, LinkLoad, Load
-
-
-@dataclass(frozen=True, eq=False)
-class Balance:
-    """Attributes:
-    residual: r `[*batch, nv]` [N, N m]; zero where Newton's law holds at the end of the step.
-    jacobian: J = ∂r/∂θ `[*batch, nv, nv]`, exact, in the exponential chart at q; not symmetric once there is friction.
-    stiffness: the part of J without the curvature of the tree (B = 0).
-    """
-
-    residual: Tensor
-    jacobian: Tensor
-    stiffness: Tensor
 
 
 def subtree_sums(placement: Placement, loads: Sequence[LinkLoad]) -> tuple[Tensor, Tensor]:
@@ -47,30 +34,43 @@ def link_residual(placement: Placement, moment: Tensor) -> Tensor:
     return (placement.axes * wrench[..., placement.articulation.topology.dof_joint, :]).sum(-1)
 
 
-def assemble(placement: Placement, loads: Sequence[Load]) -> Balance:
-    """Residual and Jacobian of a sum of loads, of which at least one is on links."""
-    t = placement.articulation.topology
-    axes = placement.axes
-    moment, stiffness = subtree_sums(placement, [x for x in loads if isinstance(x, LinkLoad)])
-    residual = link_residual(placement, moment)
+class Balance:
+    """The balance of a sum of loads, of which at least one is on links. The matrices are assembled when first asked for.
 
-    column = axes[..., None]
-    summed = stiffness[..., t.dof_joint, :, :]
-    below = (summed @ column).squeeze(-1)  # A s_j: j moves, the rows at or above j feel it
-    above = (summed.mT @ column).squeeze(-1)  # Aᵀ s_j: something above moves, row j feels it
-    upper = (t.above | t.same_joint).to(axes.dtype)
-    lower = t.above.T.to(axes.dtype)
-    convex = upper * (axes @ below.mT) + lower * (above @ axes.mT)
+    residual: r `[*batch, nv]` [N, N m]; zero where Newton's law holds at the end of the step."""
 
-    omega, v = axes[..., :3], axes[..., 3:]
-    first = moment[..., :3][..., t.dof_joint, :, :]
-    force = moment[..., 3][..., t.dof_joint, :]
-    trace = first.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
-    turned = (first.mT @ omega[..., None]).squeeze(-1) - trace * omega - torch.linalg.cross(*torch.broadcast_tensors(force, v))
-    curved = t.curvature_weight.to(axes.dtype) * (omega @ turned.mT)
+    def __init__(self, placement: Placement, loads: Sequence[Load]) -> None:
+        self._placement = placement
+        self._on_joints = [x for x in loads if isinstance(x, JointLoad)]
+        self._moment, self._stiffness = subtree_sums(placement, [x for x in loads if isinstance(x, LinkLoad)])
+        self.residual = link_residual(placement, self._moment)
+        for load in self._on_joints:
+            self.residual = self.residual + load.residual
 
-    for load in loads:
-        if isinstance(load, JointLoad):
-            residual = residual + load.residual
+    @cached_property
+    def stiffness(self) -> Tensor:
+        """The part of J without the curvature of the tree (B = 0), `[*batch, nv, nv]`."""
+        t, axes = self._placement.articulation.topology, self._placement.axes
+        column = axes[..., None]
+        summed = self._stiffness[..., t.dof_joint, :, :]
+        below = (summed @ column).squeeze(-1)  # A s_j: j moves, the rows at or above j feel it
+        above = (summed.mT @ column).squeeze(-1)  # Aᵀ s_j: something above moves, row j feels it
+        upper = (t.above | t.same_joint).to(axes.dtype)
+        lower = t.above.T.to(axes.dtype)
+        convex = upper * (axes @ below.mT) + lower * (above @ axes.mT)
+        for load in self._on_joints:
             convex = convex + load.stiffness
-    return Balance(residual, convex + curved + curved.mT, convex)
+        return convex
+
+    @cached_property
+    def jacobian(self) -> Tensor:
+        """J = ∂r/∂θ `[*batch, nv, nv]`, exact, in the exponential chart at q; not symmetric once there is friction."""
+        t, axes = self._placement.articulation.topology, self._placement.axes
+        omega, v = axes[..., :3], axes[..., 3:]
+        first = self._moment[..., :3][..., t.dof_joint, :, :]
+        force = self._moment[..., 3][..., t.dof_joint, :]
+        trace = first.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+        torque = torch.linalg.cross(*torch.broadcast_tensors(force, v))
+        turned = (first.mT @ omega[..., None]).squeeze(-1) - trace * omega - torque
+        curved = t.curvature_weight.to(axes.dtype) * (omega @ turned.mT)
+        return self.stiffness + curved + curved.mT

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import assemble, link_residual, subtree_sums
+from pbfd_torch.assembly import Balance, link_residual, subtree_sums
 from pbfd_torch.kinematics import Placement, place, pose_rates
 from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.inertia import inertia_stiffness
@@ -27,11 +27,15 @@ def armature_diagonal(articulation: Articulation, terms: Sequence[Term]) -> Tens
 
 def mass_matrix(articulation: Articulation, q: Tensor, terms: Sequence[Term] = ()) -> Tensor:
     """Joint-space mass matrix M(q) `[*batch, nv, nv]`; `terms` may hold armatures, which add to its diagonal."""
-    placement = place(articulation, q)
-    second = placement.poses @ articulation.pseudo_inertia @ placement.poses.mT
+    return mass_matrix_at(place(articulation, q), terms)
+
+
+def mass_matrix_at(placement: Placement, terms: Sequence[Term] = ()) -> Tensor:
+    """As `mass_matrix`, of an articulation that is placed already."""
+    second = placement.poses @ placement.articulation.pseudo_inertia @ placement.poses.mT
     still = torch.zeros_like(second[..., :3, :])
-    inertia = assemble(placement, [LinkLoad(still, inertia_stiffness(second))]).jacobian
-    return inertia + torch.diag_embed(armature_diagonal(articulation, terms))
+    inertia = Balance(placement, [LinkLoad(still, inertia_stiffness(second))]).stiffness
+    return inertia + torch.diag_embed(armature_diagonal(placement.articulation, terms))
 
 
 def _acceleration_load(placement: Placement, acceleration: Tensor) -> LinkLoad:

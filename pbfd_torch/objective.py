@@ -1,50 +1,79 @@
-"""The balance of forces at the end of a step, as a solver sees it: residual, Jacobian, retract (the root of Eq. 13)."""
+"""The balance of forces at the end of a step, as a solver sees it, and its energy where forces are conservative."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, force_scale, reach
-from pbfd_torch.assembly import Balance, assemble
-from pbfd_torch.dynamics import armature_diagonal
-from pbfd_torch.kinematics import place, retract
-from pbfd_torch.terms.load import OneSided, StepContext, Term
+from pbfd_torch.assembly import Balance
+from pbfd_torch.dynamics import armature_diagonal, mass_matrix_at
+from pbfd_torch.errors import InputError
+from pbfd_torch.kinematics import Placement, place, retract
+from pbfd_torch.solvers.objective import Evaluation, weighted_error
+from pbfd_torch.terms.load import Frictional, Load, OneSided, Potential, StepContext, Term
+from pbfd_torch.worlds import Worlds
 
 
 @dataclass(frozen=True, eq=False)
 class BalanceObjective:
-    """r(θ) of one step for all worlds.
+    """r(θ) of one step for all worlds: the root of Eq. 13.
 
     Attributes:
-        articulation, terms, prepared: what acts, and what each term prepared for this step.
+        articulation, terms, step, prepared: what acts, in which step, and what each term prepared for it.
         scale: `[*batch, nv]` the size of a force that counts as one, see `force_scale`.
-        rounding: `[*batch, nv]` the size of the rounding error in r, see `inertia_rounding`.
-        guess: `[*batch, nq]` where inertia alone would end the step.
+        extent: `[*batch, nv]` size of what is rounded in each coordinate: the distance from the world's origin [m], or 1 rad.
+        rounding: `[*batch, nv]` the size of the rounding error in r that inertia leaves, see `inertia_rounding`.
     """
 
     articulation: Articulation
     terms: Sequence[Term]
+    step: StepContext
     prepared: Sequence[Any]
     scale: Tensor
+    extent: Tensor
     rounding: Tensor
-    guess: Tensor
 
-    @staticmethod
-    def of_step(articulation: Articulation, terms: Sequence[Term], step: StepContext, scale: Tensor) -> BalanceObjective:
+    @classmethod
+    def of_step(cls, articulation: Articulation, terms: Sequence[Term], step: StepContext, scale: Tensor) -> BalanceObjective:
         """Prepares every term for the step."""
         prepared = [term.prepare(step) for term in terms]
-        return BalanceObjective(articulation, terms, prepared, scale, inertia_rounding(articulation, terms, step), step.target_q)
+        far = step.previous.poses[..., :3, 3].abs().amax((-2, -1)) + reach(articulation)
+        turns = articulation.topology.turns
+        extent = torch.where(turns, torch.ones_like(far)[..., None], far[..., None])
+        return cls(articulation, terms, step, prepared, scale, extent, inertia_rounding(articulation, terms, step, far))
+
+    @property
+    def guess(self) -> Tensor:
+        """`[*batch, nq]` where inertia alone would end the step."""
+        return self.step.target_q
+
+    @cached_property
+    def metric(self) -> Tensor:
+        """κ M(θ_n) `[*batch, nv, nv]`: how inertia alone would resist a step."""
+        return self.step.weight[..., None, None] * mass_matrix_at(self.step.previous, self.terms)
+
+    def loads(self, placement: Placement) -> list[Load]:
+        """Every term's load at a placement."""
+        return [term.load(prepared, placement) for term, prepared in zip(self.terms, self.prepared, strict=True)]
 
     def evaluate(self, q: Tensor) -> Balance:
         """Residual, Jacobian and stiffness at q."""
         placement = place(self.articulation, q)
-        return assemble(placement, [t.load(p, placement) for t, p in zip(self.terms, self.prepared, strict=True)])
+        return Balance(placement, self.loads(placement))
+
+    def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
+        """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`; the rounding is that of inertia and of what the Jacobian makes of
+        coordinates that are rounded themselves: stiff friction feels a displacement of ε|x|."""
+        epsilon = 4 * torch.finfo(self.scale.dtype).eps
+        felt = (evaluation.jacobian.abs() * self.extent[..., None, :]).sum(-1)
+        return weighted_error(evaluation.residual, self.scale, self.rounding + epsilon * felt, tolerance)
 
     def retract(self, q: Tensor, step: Tensor) -> Tensor:
         """q moved by the tangent vector `step`."""
@@ -54,16 +83,83 @@ class BalanceObjective:
         """Largest rotation [rad] of one joint in a tangent step, `[*batch]`."""
         return (step.abs() * self.articulation.topology.turns.to(step.dtype)).amax(-1)
 
-    def softened(self, factor: float) -> BalanceObjective:
+    def take(self, index: Tensor) -> Self:
+        """The same step of some worlds only."""
+        worlds = Worlds(self.guess.shape[:-1], index)
+        terms = [term.take(worlds) for term in self.terms]
+        step = self.step.take(worlds)
+        return dataclasses.replace(
+            self,
+            articulation=step.previous.articulation,
+            terms=terms,
+            step=step,
+            prepared=[term.prepare(step) for term in terms],
+            scale=worlds.pick(self.scale, 1),
+            extent=worlds.pick(self.extent, 1),
+            rounding=worlds.pick(self.rounding, 1),
+        )
+
+    def softened(self, factor: float) -> Self:
         """The same step with contacts and joint limits `factor` times as stiff."""
-        softer = [term.softened(factor) if isinstance(term, OneSided) else term for term in self.terms]
-        return dataclasses.replace(self, terms=softer)
+        return self._with([term.softened(factor) if isinstance(term, OneSided) else term for term in self.terms])
+
+    def widened(self, factor: float) -> Self:
+        """The same step with friction smooth over `factor` times as wide a range of slip."""
+        return self._with([term.widened(factor) if isinstance(term, Frictional) else term for term in self.terms])
+
+    def lagged(self, q: Tensor) -> EnergyObjective:
+        """The step whose friction feels the normal forces at q whatever comes: its balance is the gradient of an energy."""
+        placement = place(self.articulation, q)
+        terms = [
+            term.lagged(prepared, placement) if isinstance(term, Frictional) else term
+            for term, prepared in zip(self.terms, self.prepared, strict=True)
+        ]
+        return EnergyObjective(self.articulation, terms, self.step, self.prepared, self.scale, self.extent, self.rounding)
+
+    def _with(self, terms: Sequence[Term]) -> Self:
+        return dataclasses.replace(self, terms=terms)
 
 
-def inertia_rounding(articulation: Articulation, terms: Sequence[Term], step: StepContext) -> Tensor:
+@dataclass(frozen=True, eq=False)
+class EnergyObjective(BalanceObjective):
+    """E(θ) of one step (Eq. 6), where every load is the gradient of an energy: friction must be lagged or absent. Raises
+    `InputError` for a term that has no energy."""
+
+    def __post_init__(self) -> None:
+        for term in self.terms:
+            if not isinstance(term, Potential):
+                raise InputError(f"{type(term).__name__} has no energy: a step with it can be solved as a balance of forces only")
+
+    def evaluate(self, q: Tensor) -> Energy:
+        """Energy, gradient and Hessian at q."""
+        placement = place(self.articulation, q)
+        return Energy(placement, self.loads(placement), self)
+
+    def energy(self, placement: Placement) -> Tensor:
+        """E [J] `[*batch]`, up to a constant."""
+        total = torch.zeros((), dtype=self.scale.dtype, device=self.scale.device)
+        for term, prepared in zip(self.terms, self.prepared, strict=True):
+            if isinstance(term, Potential):
+                total = total + term.energy(prepared, placement)
+        return total
+
+
+class Energy(Balance):
+    """The balance of an `EnergyObjective`, with the energy itself."""
+
+    def __init__(self, placement: Placement, loads: Sequence[Load], objective: EnergyObjective) -> None:
+        super().__init__(placement, loads)
+        self._objective = objective
+
+    @cached_property
+    def value(self) -> Tensor:
+        """E [J] `[*batch]`."""
+        return self._objective.energy(self._placement)
+
+
+def inertia_rounding(articulation: Articulation, terms: Sequence[Term], step: StepContext, far: Tensor) -> Tensor:
     """Rounding error `[*batch, nv]` left in the inertial forces [N, N m]: they are κ m times differences of positions x that were
-    rounded to ε|x|. It grows with 1/Δt² and with the distance from the world's origin."""
-    far = step.previous.poses[..., :3, 3].abs().amax((-2, -1)) + reach(articulation)
+    rounded to ε|x|. It grows with 1/Δt² and with the distance `far` `[*batch]` [m] from the world's origin."""
     lever = force_scale(articulation, 1.0)
     moved = far[..., None] * lever + armature_diagonal(articulation, terms)
     return 8 * torch.finfo(far.dtype).eps * step.weight[..., None] * moved

@@ -26,6 +26,7 @@ class Recorder:
         self._scene, self._integrator, self._dt = scene, integrator, dt
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0
+        self._lanes = 0
         self._add(**self._state(state, place(scene.articulation, state.q)))
 
     def _add(self, **entries: Tensor) -> None:
@@ -58,6 +59,7 @@ class Recorder:
             "iterations": solution.iterations,
             "evaluations": solution.evaluations,
             "residual_norm": solution.residual_norm,
+            "fallbacks": solution.fallbacks,
         }
         pairs = zip(objective.terms, objective.prepared, strict=True)
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact)]
@@ -68,9 +70,10 @@ class Recorder:
             entries["contact_force"] = torch.cat([x.force for x in points], -2)
         self._add(**entries)  # all at once, at the end: an interruption before this leaves the record as it was
         self.steps += 1
+        self._lanes += solution.lanes
 
-    def finish(self) -> Rollout:
-        """The record so far."""
+    def finish(self, lanes: int | None = None) -> Rollout:
+        """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
         stacked = {name: torch.stack(values) for name, values in self._entries.items()}
         like = stacked["q"]
         if "contact_depth" not in stacked:
@@ -82,6 +85,7 @@ class Recorder:
             dt=self._dt,
             link_names=self._scene.articulation.link_names,
             joint_names=self._scene.articulation.joint_names,
+            lanes=torch.tensor(self._lanes if lanes is None else lanes),
             time=self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device),
             **stacked,
         )

@@ -19,7 +19,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.solvers.objective import is_solved
 
-FORMAT = "pbfd_torch rollout 1"
+FORMAT = "pbfd_torch rollout 2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,8 @@ class Rollout:
             earlier than the potential one, which holds gravity, springs, limits and contacts.
         linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
+        fallbacks: `[T, *batch, 3]` int, how often each of `FALLBACKS` was tried.
+        lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
             `[T, *batch, npoint, 3]` on the body.
     """
@@ -59,6 +61,8 @@ class Rollout:
     iterations: Tensor
     evaluations: Tensor
     residual_norm: Tensor
+    fallbacks: Tensor
+    lanes: Tensor
     contact_point: Tensor
     contact_depth: Tensor
     contact_force: Tensor
@@ -78,6 +82,11 @@ class Rollout:
         if self.contact_depth.shape[-1] == 0:
             return self.contact_depth.new_zeros(self.contact_depth.shape[:-1])
         return self.contact_depth.amax(-1).clamp_min(0)
+
+    @property
+    def utilisation(self) -> float:
+        """Share of the evaluations spent that went to worlds which needed them (Fig. 3)."""
+        return float(self.evaluations.sum()) / float(self.lanes)
 
     @property
     def solved(self) -> Tensor:

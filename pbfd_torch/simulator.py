@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,17 +21,21 @@ from pbfd_torch.kinematics import Placement, place, pose_rates
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.solvers.continuation import Continuation
-from pbfd_torch.solvers.objective import Objective, Solution
+from pbfd_torch.solvers.fallbacks import Fallbacks, merged
+from pbfd_torch.solvers.lock_step import mapped
+from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Conservative, Term
+from pbfd_torch.worlds import Worlds, replaced
+
+SHORTEST_STEP = 1e-5  # [s]
 
 
 class Solver(Protocol):
     """What finds the end of a step."""
 
-    def solve(self, objective: Objective, guess: Tensor, retreat: Tensor | None = None) -> Solution:
+    def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
         """Root of the objective for every world, from `guess`, or from `retreat` where that is the safer start."""
         ...
 
@@ -93,20 +98,37 @@ class Scene:
         """Length of the control vector."""
         return sum(term.nu for term in self.terms if isinstance(term, Actuators))
 
+    def take(self, worlds: Worlds) -> Scene:
+        """The same scene with the parameters of some worlds."""
+        terms = tuple(term.take(worlds) for term in self.terms)
+        return replaced(self, articulation=self.articulation.take(worlds), terms=terms, gravity=worlds.pick(self.gravity, 1))
+
 
 class Simulator:
-    """Steps a scene. `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions'
-    differences."""
+    """Steps a scene.
 
-    def __init__(self, scene: Scene, dt: float, integrator: ImplicitEuler | None = None, solver: Solver | None = None) -> None:
-        if not (math.isfinite(dt) and dt >= 1e-5):
+    `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions' differences. `halvings`: how
+    often a world's step may be halved (2, 4, 8 … shorter steps) where nothing else solves it; 0: never."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        dt: float,
+        integrator: ImplicitEuler | None = None,
+        solver: Solver | None = None,
+        halvings: int = 3,
+    ) -> None:
+        if not (math.isfinite(dt) and dt >= SHORTEST_STEP):
             raise InputError(f"dt is {dt} s: must be a finite number ≥ 1e-5")
+        if halvings < 0:
+            raise InputError(f"halvings is {halvings}: must be ≥ 0")
         a = scene.articulation
         self.scene = scene
         self.dt = float(dt)
         self.integrator = integrator or ImplicitEuler()
-        self.solver: Solver = solver or Continuation()
-        self._dt = torch.tensor(dt, dtype=a.dtype, device=a.device)
+        self.solver: Solver = solver or Fallbacks()
+        self.halvings = halvings
+        self.step_size = torch.tensor(dt, dtype=a.dtype, device=a.device)
         parameters = (scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
         self._batch = torch.broadcast_shapes(*parameters)
         self._scale = force_scale(a, torch.linalg.vector_norm(scene.gravity, dim=-1))
@@ -123,11 +145,11 @@ class Simulator:
         batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
         q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
         q = a.topology.normalized(q)
-        still = self.integrator.start(a, q, v, torch.zeros_like(v), self._dt)
+        still = self.integrator.start(a, q, v, torch.zeros_like(v), self.step_size)
         trial, solution = self.step(still, control)
-        gained = self.integrator.velocity(a, trial, self._dt) - v
-        acceleration = torch.where(solution.solved[..., None], gained / self._dt, 0.0)
-        return self.integrator.start(a, q, v, acceleration, self._dt)
+        gained = self.integrator.velocity(a, trial, self.step_size) - v
+        acceleration = torch.where(solution.solved[..., None], gained / self.step_size, 0.0)
+        return self.integrator.start(a, q, v, acceleration, self.step_size)
 
     def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
         a = self.scene.articulation
@@ -142,7 +164,7 @@ class Simulator:
     def objective(self, state: State, control: Tensor | None = None) -> BalanceObjective:
         """The balance of forces that the step from `state` solves."""
         articulation = self.scene.articulation
-        context = self.integrator.context(articulation, state, self._dt, self.scene.gravity, control)
+        context = self.integrator.context(articulation, state, self.step_size, self.scene.gravity, control)
         return BalanceObjective.of_step(articulation, self.scene.terms, context, self._scale)
 
     def step(self, state: State, control: Tensor | None = None) -> tuple[State, Solution]:
@@ -155,7 +177,49 @@ class Simulator:
         with torch.no_grad():
             objective = self.objective(state, control)
             solution = self.solver.solve(objective, objective.guess, state.q)
-            return self.integrator.advance(state, solution.q), solution, objective
+            return *self.finished(state, control, solution), objective
+
+    def finished(self, state: State, control: Tensor | None, solution: Solution) -> tuple[State, Solution]:
+        """The state after a step that the solver has left at `solution`: unsolved worlds try shorter steps first."""
+        advanced = self.integrator.advance(state, solution.q)
+        for halvings in range(1, self.halvings + 1):
+            index = unsolved_worlds(solution)
+            if len(index) == 0 or self.dt / 2**halvings < SHORTEST_STEP:
+                break
+            advanced, solution = self._halved(state, control, advanced, solution, index, 2**halvings)
+        return advanced, solution
+
+    def take(self, worlds: Worlds) -> Simulator:
+        """The simulator of some worlds."""
+        return Simulator(self.scene.take(worlds), self.dt, self.integrator, self.solver, self.halvings)
+
+    def _halved(
+        self, state: State, control: Tensor | None, advanced: State, solution: Solution, index: Tensor, parts: int
+    ) -> tuple[State, Solution]:
+        """The step of the worlds at `index` again, as `parts` shorter ones; a world keeps the result if all of them solve. It then
+        goes on with the velocity of the last one."""
+        worlds = Worlds(state.q.shape[:-1], index)
+        short = Simulator(self.scene.take(worlds), self.dt / parts, self.integrator, self.solver, halvings=0)
+        now = self.integrator.resized(short.scene.articulation, state.take(worlds), self.step_size, short.step_size)
+        held = None if control is None else worlds.pick(control, 1)
+        climbs: list[Solution] = []
+        for _ in range(parts):
+            now, climb = short.step(now, held)
+            climbs.append(climb)
+        end = self.integrator.resized(short.scene.articulation, now, short.step_size, self.step_size)
+        solved = torch.stack([x.solved for x in climbs]).all(0)
+        worst = torch.stack([x.residual_norm for x in climbs]).amax(0)
+        failed = torch.where(solved, climbs[-1].status, int(Status.STALLED))
+        # an unfinished chain of short steps is no better end of the whole step, whatever its own residual
+        climbs[-1] = dataclasses.replace(climbs[-1], status=failed, residual_norm=torch.where(solved, worst, math.inf))
+        result = merged(solution, index, climbs, FALLBACKS.index("halving"), Status.HALVED)
+
+        def put(old: Tensor, new: Tensor) -> Tensor:
+            rows = old.reshape(-1, old.shape[-1])
+            chosen = torch.where(solved.reshape(-1, 1), new.reshape(-1, old.shape[-1]), rows[index])
+            return rows.index_copy(0, index, chosen).reshape(old.shape)
+
+        return mapped(put, advanced, end), result
 
     def rollout(
         self,

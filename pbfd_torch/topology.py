@@ -116,8 +116,8 @@ class Topology:
 
     @cached_property
     def moving(self) -> Tensor:
-        """Mask over `turning_joint`: which of them translate as well (free joints)."""
-        return torch.tensor([self.joint_sizes[j][1] == 6 for j in self._turning], dtype=torch.bool, device=self.device)
+        """Positions in `turning_joint` of those that translate as well (free joints)."""
+        return self._long([k for k, j in enumerate(self._turning) if self.joint_sizes[j][1] == 6])
 
     @cached_property
     def free_q(self) -> Tensor:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self, runtime_checkable
 
+import torch
 from torch import Tensor
 
 
@@ -13,33 +14,45 @@ class Status(enum.IntEnum):
     """How one world's solve ended."""
 
     SOLVED = 0
-    CONTINUED = 1  # solved, by continuation in stiffness
-    STALLED = 2  # no step along the search direction helps
-    ITERATION_LIMIT = 3
-    NON_FINITE = 4  # NaN or infinity in the guess or in the residual there
+    WARM_STARTED = 1  # solved, from the minimiser of the energy with lagged friction
+    CONTINUED = 2  # solved, by continuation in the friction's width or in stiffness
+    HALVED = 3  # solved, as two or more shorter steps
+    STALLED = 4  # no step along the search direction helps
+    ITERATION_LIMIT = 5
+    NON_FINITE = 6  # NaN or infinity in the guess or in the residual there
 
 
 def is_solved(status: Tensor) -> Tensor:
     """Which of the statuses, values of `Status`, are those of a solved world; bool, same shape."""
-    return status <= int(Status.CONTINUED)
+    return status <= int(Status.HALVED)
 
 
 class Evaluation(Protocol):
-    """Values at one point, for every world of the batch."""
+    """Values at one point, for every world of the batch; what is not asked for need not be computed."""
 
     @property
     def residual(self) -> Tensor:
-        """r `[*batch, n]`."""
+        """r `[*batch, n]`; the gradient where the problem is a minimisation."""
         ...
 
     @property
     def jacobian(self) -> Tensor:
-        """∂r/∂θ `[*batch, n, n]`, exact."""
+        """∂r/∂θ `[*batch, n, n]`, exact; the Hessian where the problem is a minimisation."""
         ...
 
     @property
     def stiffness(self) -> Tensor:
         """An approximation of the Jacobian `[*batch, n, n]` whose step descends where the exact one's does not."""
+        ...
+
+
+@runtime_checkable
+class Valued(Protocol):
+    """An evaluation of a problem that is a minimisation."""
+
+    @property
+    def value(self) -> Tensor:
+        """What is minimised, `[*batch]`; its gradient is the residual."""
         ...
 
 
@@ -52,12 +65,17 @@ class Objective(Protocol):
         ...
 
     @property
-    def rounding(self) -> Tensor:
-        """Size of the rounding error in a residual entry, likewise; nothing smaller can be asked for."""
+    def metric(self) -> Tensor:
+        """A positive definite matrix `[n, n]` or `[*batch, n, n]` that measures steps: what of the Jacobian is always there."""
         ...
 
     def evaluate(self, q: Tensor) -> Evaluation:
         """Residual and Jacobian at q `[*batch, nq]`."""
+        ...
+
+    def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
+        """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`: at most `tolerance` where solved, nothing below rounding being asked
+        for. Of a derived problem (GE for E): that of the original one."""
         ...
 
     def retract(self, q: Tensor, step: Tensor) -> Tensor:
@@ -68,19 +86,45 @@ class Objective(Protocol):
         """Largest rotation [rad] in a tangent vector, `[*batch]`."""
         ...
 
-    def softened(self, factor: float) -> Objective:
+    def take(self, index: Tensor) -> Self:
+        """The problems of some worlds only: positions `[m]` in the flattened batch; the result has batch shape `[m]`."""
+        ...
+
+
+class Relaxable(Objective, Protocol):
+    """An objective that knows easier problems close to it, for the fallbacks."""
+
+    def softened(self, factor: float) -> Relaxable:
         """The same problem with its stiff one-sided forces scaled by `factor` ≤ 1."""
         ...
+
+    def widened(self, factor: float) -> Relaxable:
+        """The same problem with friction smooth over a `factor` ≥ 1 times wider range of slip."""
+        ...
+
+    def lagged(self, q: Tensor) -> Objective:
+        """The minimisation that is left with the friction's normal forces frozen as they are at q."""
+        ...
+
+
+def weighted_error(residual: Tensor, scale: Tensor, rounding: Tensor | float, tolerance: float) -> Tensor:
+    """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`."""
+    return torch.linalg.vector_norm(residual / (scale + rounding / tolerance), dim=-1)
+
+
+FALLBACKS = ("warm start", "continuation", "halving")
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Attributes, each per world:
+    """Attributes, each per world but the last:
     q: `[*batch, nq]` the best point found; the guess itself, bitwise, where it solves the problem.
     status: `[*batch]` int, values of `Status`.
     residual_norm: `[*batch]` ‖r / (scale + rounding/tolerance)‖₂.
     iterations: `[*batch]` int, steps taken.
     evaluations: `[*batch]` int, evaluations of the residual spent.
+    fallbacks: `[*batch, 3]` int, how often a warm start, a continuation and a halving of the step was tried (`FALLBACKS`).
+    lanes: evaluations that the schedule spent on all worlds together, those on finished worlds included.
     """
 
     q: Tensor
@@ -88,8 +132,15 @@ class Solution:
     residual_norm: Tensor
     iterations: Tensor
     evaluations: Tensor
+    fallbacks: Tensor
+    lanes: int = 0
 
     @property
     def solved(self) -> Tensor:
         """`[*batch]` bool."""
         return is_solved(self.status)
+
+
+def unsolved_worlds(solution: Solution) -> Tensor:
+    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start."""
+    return (~solution.solved & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import force_scale
-from pbfd_torch.assembly import assemble, subtree_sums
+from pbfd_torch.assembly import Balance, subtree_sums
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
 from pbfd_torch.kinematics import link_jacobians, place, retract
 from pbfd_torch.objective import BalanceObjective
@@ -112,7 +112,7 @@ def test_residual_is_minus_the_virtual_work(seed: int) -> None:
         jacobians[..., :3, :], point[..., None].expand_as(jacobians[..., :3, :]), dim=-2
     )
     expected = -(velocity.mT @ force[..., None]).squeeze(-1).sum(-2)
-    torch.testing.assert_close(assemble(placement, [load]).residual, expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(Balance(placement, [load]).residual, expected, rtol=1e-12, atol=1e-12)
 
 
 @all_trees

@@ -25,7 +25,7 @@ from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator,
 from pbfd_torch.models import SCENES, Setup
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.solvers.jtj_lm import JtjLm
+from pbfd_torch.solvers.descent import Descent
 from tests.gymnasium_files import gymnasium_file
 
 ROOT = Path(__file__).parent.parent
@@ -94,7 +94,7 @@ def pbfd(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 @pytest.fixture
 def unsolvable(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gives the solver a single evaluation."""
-    monkeypatch.setattr(Choices, "make_solver", lambda self: JtjLm(max_evaluations=1))
+    monkeypatch.setattr(Choices, "make_solver", lambda self: Descent(max_evaluations=1))
 
 
 # simulate -----------------------------------------------------------------------------------------------------------------

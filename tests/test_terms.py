@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link, homogeneous
-from pbfd_torch.assembly import assemble
+from pbfd_torch.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
@@ -481,7 +481,7 @@ def test_force_acts_at_the_surface() -> None:
         after = before.clone()
         after[0] += 0.01
         points, load = contact_points(articulation, made, before, after, 0.01)
-        residual = assemble(place(articulation, after), [load]).residual
+        residual = Balance(place(articulation, after), [load]).residual
         force = points.force[0]
         arm = torch.tensor([0.0, 0.0, -lever], dtype=torch.float64)
         torch.testing.assert_close(residual[:3], -force, rtol=1e-12, atol=1e-12)

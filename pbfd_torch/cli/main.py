@@ -1,4 +1,4 @@
-"""The `pbfd` command: simulate, info, scenes, demo."""
+"""The `pbfd` command: simulate, info, scenes, demo, bench."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, SolverChoice, load_setup, use_threads
+from pbfd_torch.cli.bench_solvers import bench
+from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
 from pbfd_torch.errors import NotModelledWarning, PbfdError
 
 app = typer.Typer(
@@ -19,6 +20,7 @@ app = typer.Typer(
     help="Articulated bodies with frictional contact, stable at large time steps. "
     "Exit status: 0 solved, 1 some step unsolved, 2 bad input.",
 )
+app.add_typer(bench, name="bench")
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)
 
@@ -31,12 +33,18 @@ def simulate(
     dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: the scene's.")] = None,
     integrator: Annotated[Integrator, typer.Option(help="Time integrator.")] = Integrator.IMPLICIT_EULER,
     solver: Annotated[
-        SolverChoice, typer.Option(help="Solver; direct: without continuation where a step stalls.")
+        SolverChoice, typer.Option(help="Solver; direct: without fallbacks; damped, lm, lbfgs: on ½‖r‖², as the paper has them.")
     ] = SolverChoice.JTJ_LM,
     friction: Annotated[Friction | None, typer.Option(help="Friction law; default: the scene's (Coulomb).")] = None,
     dtype: Annotated[Dtype, typer.Option(help="Floating-point type.")] = Dtype.FLOAT64,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.CPU,
-    threads: Annotated[int, typer.Option(help="CPU threads; more than one pays for large batches on idle cores only.")] = 1,
+    schedule: Annotated[
+        Schedule, typer.Option(help="Asynchronous: a world that is done with a step does not wait for the others.")
+    ] = Schedule.LOCK_STEP,
+    workers: Annotated[int, typer.Option(help="Processes that share the worlds, one CPU core each.")] = 1,
+    threads: Annotated[
+        int, typer.Option(help="PyTorch's threads inside an operation; more than one pays for very large batches only.")
+    ] = 1,
     seed: Annotated[int | None, typer.Option(help="Give all worlds but the first small random extra velocities.")] = None,
     fixed_base: Annotated[
         bool | None,
@@ -52,7 +60,8 @@ def simulate(
     from pbfd_torch.cli.simulate import run
 
     use_threads(threads)
-    choices = Choices(integrator, solver, friction, dtype, device, seed, None if fixed_base is None else not fixed_base, keyframe)
+    free_base = None if fixed_base is None else not fixed_base
+    choices = Choices(integrator, solver, friction, dtype, device, seed, free_base, keyframe, schedule, workers)
     raise typer.Exit(run(load_setup(scene, worlds, choices), choices, duration, dt, out, as_json))
 
 

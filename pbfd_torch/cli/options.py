@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import torch
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import SCENES, Setup, file_setup
 from pbfd_torch.simulator import Solver
-from pbfd_torch.solvers.continuation import Continuation
-from pbfd_torch.solvers.jtj_lm import JtjLm
+from pbfd_torch.solvers.descent import Descent
+from pbfd_torch.solvers.fallbacks import Fallbacks
+from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
 from pbfd_torch.terms.contact import Contact, FrictionLaw
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
@@ -29,6 +31,14 @@ class Integrator(enum.StrEnum):
 class SolverChoice(enum.StrEnum):
     JTJ_LM = "jtj-lm"
     JTJ_LM_DIRECT = "jtj-lm-direct"
+    JTJ_LM_DAMPED = "jtj-lm-damped"
+    LM = "lm"
+    LBFGS = "lbfgs"
+
+
+class Schedule(enum.StrEnum):
+    LOCK_STEP = "lock-step"
+    ASYNCHRONOUS = "asynchronous"
 
 
 class Friction(enum.StrEnum):
@@ -52,6 +62,15 @@ class Device(enum.StrEnum):
     CUDA = "cuda"
 
 
+_SOLVERS: dict[SolverChoice, Callable[[], Solver]] = {
+    SolverChoice.JTJ_LM: Fallbacks,
+    SolverChoice.JTJ_LM_DIRECT: Descent,
+    SolverChoice.JTJ_LM_DAMPED: jtj_lm,
+    SolverChoice.LM: lambda: OnSquares(lm()),
+    SolverChoice.LBFGS: lambda: OnSquares(lbfgs()),
+}
+
+
 @dataclass(frozen=True)
 class Choices:
     """What the user chose, besides the scene, its length and where the result goes."""
@@ -64,9 +83,19 @@ class Choices:
     seed: int | None = None
     free_base: bool | None = None
     keyframe: str | None = None
+    schedule: Schedule = Schedule.LOCK_STEP
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise InputError(f"--workers is {self.workers}: must be ≥ 1")
+        if self.schedule is Schedule.ASYNCHRONOUS and self.workers > 1:
+            raise InputError(f"--workers is {self.workers}: must be 1 with --schedule asynchronous")
+        if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
+            raise InputError(f"--solver is {self.solver.value}: must be one of the jtj-lm with --schedule asynchronous")
 
     def make_solver(self) -> Solver:
-        return Continuation() if self.solver is SolverChoice.JTJ_LM else JtjLm()
+        return _SOLVERS[self.solver]()
 
 
 def use_threads(count: int) -> None:

@@ -16,12 +16,14 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.cli.options import Choices, with_friction
+from pbfd_torch.asynchronous import AsynchronousRollout
+from pbfd_torch.cli.options import Choices, Schedule, with_friction
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import Setup
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Status
+from pbfd_torch.workers import Workers
 
 MAX_STEPS = 10_000_000
 
@@ -56,11 +58,15 @@ class Result:
             "ms_per_simulated_s_per_world": 1e3 * self.wall_s / duration / self.setup.worlds,
             "solved_fraction": float(r.solved.to(torch.float64).mean()),
             "unsolved_steps": int((~r.solved).sum()),
+            "warm_started_steps": int((r.status == int(Status.WARM_STARTED)).sum()),
             "continued_steps": int((r.status == int(Status.CONTINUED)).sum()),
+            "halved_steps": int((r.status == int(Status.HALVED)).sum()),
             "iterations_mean": float(iterations.mean()),
             "iterations_p95": float(iterations.sort().values[math.ceil(0.95 * len(iterations)) - 1]),
             "iterations_max": int(iterations.max()),
             "evaluations_mean": float(r.evaluations.to(torch.float64).mean()),
+            "schedule": self.choices.schedule.value,
+            "lane_utilisation": r.utilisation,
             "max_penetration_m": float(r.penetration.max()),
             "energy_start_J": float(start[0]),
             "energy_end_J": float(r.energy[-1, 0]),
@@ -98,11 +104,20 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
         raise InputError(f"--duration {duration} s at --dt {dt} s makes {steps} steps: must be at most {MAX_STEPS}")
     setup = with_friction(setup, choices.friction, dt)
     simulator = Simulator(setup.scene, dt, solver=choices.make_solver())
+    controls = setup.controls(steps)
+    if choices.workers > setup.worlds:
+        raise InputError(f"--workers is {choices.workers}: must be at most the number of worlds, {setup.worlds}")
     started = time.perf_counter()
-    with tqdm(total=steps, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
-        controls = setup.controls(steps)
-        state = simulator.initial_state(setup.q, setup.v, controls[0])
-        rollout = simulator.rollout(state, controls, progress=lambda done: bar.update())
+    state = simulator.initial_state(setup.q, setup.v, controls[0])
+    if choices.workers > 1:
+        with Workers(choices.workers) as workers:
+            rollout = workers.rollout(simulator, state, controls)
+    elif choices.schedule is Schedule.ASYNCHRONOUS:
+        with tqdm(total=steps * setup.worlds, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
+            rollout = AsynchronousRollout(simulator, state, steps, controls).finish(bar.update)
+    else:
+        with tqdm(total=steps, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
+            rollout = simulator.rollout(state, controls, progress=lambda done: bar.update())
     wall = time.perf_counter() - started
     if rollout.steps < steps:
         print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)

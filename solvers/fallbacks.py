@@ -1,0 +1,148 @@
+"""Fallbacks: worlds that the direct way leaves unsolved are solved along easier problems first.
+
+A detour leads to a better start: a warm start through the minimiser of the energy with lagged friction, then continuations in the
+friction's width and in stiffness. Only the unsolved worlds take it. What halves a step, which needs the integrator, is the
+simulator's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.solvers.descent import Descent
+from pbfd_torch.solvers.objective import Relaxable, Solution, Status, unsolved_worlds
+
+
+class Detour(Protocol):
+    """A way to a better start."""
+
+    @property
+    def kind(self) -> int:
+        """Its place in `objective.FALLBACKS`."""
+        ...
+
+    @property
+    def status(self) -> Status:
+        """Of a world that it helped."""
+        ...
+
+    def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
+        """Solves easier problems in turn, from `start`; the last solution is the better start."""
+        ...
+
+
+@dataclass(frozen=True)
+class WarmStart:
+    """The minimiser of E with the friction lagged: held at the normal forces of the start, then at those of the minimiser found."""
+
+    passes: int = 2
+    tolerance: float = 1e-2
+    kind: int = 0
+    status: Status = Status.WARM_STARTED
+
+    def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
+        """See `Detour`."""
+        rough = dataclasses.replace(solver, tolerance=self.tolerance)
+        climbs: list[Solution] = []
+        for _ in range(self.passes):
+            climbs.append(rough.solve(objective.lagged(start), start))
+            start = climbs[-1].q
+        return climbs
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """Stages (width of friction as a multiple, stiffness as a share of the full one), from easy to hard: wide friction does not
+    yet decide between sticking and slipping, and soft contacts let a step pass that stiff ones bend too much."""
+
+    ladder: tuple[tuple[float, float], ...]
+    tolerance: float = 1e-1
+    kind: int = 1
+    status: Status = Status.CONTINUED
+
+    def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
+        """See `Detour`."""
+        rough = dataclasses.replace(solver, tolerance=self.tolerance)
+        climbs: list[Solution] = []
+        for width, stiffness in self.ladder:
+            stage = objective.widened(width) if width > 1 else objective
+            stage = stage.softened(stiffness) if stiffness < 1 else stage
+            climbs.append(rough.solve(stage, start))
+            start = climbs[-1].q
+        return climbs
+
+
+WIDTHS = Continuation(((1000.0, 1.0), (100.0, 1.0), (10.0, 1.0)))
+STIFFNESSES = Continuation(((1.0, 1e-3), (1.0, 1e-2), (1.0, 1e-1)), tolerance=1e-2)
+
+
+@dataclass(frozen=True)
+class Fallbacks:
+    """Attributes:
+    direct: solves the problem itself.
+    last: solves the problem from where a detour has led.
+    detours: tried in turn.
+    stage: solves every stage of a detour.
+    """
+
+    direct: Descent = field(default_factory=lambda: Descent(max_evaluations=200))
+    last: Descent = field(default_factory=lambda: Descent(max_evaluations=100))
+    detours: tuple[Detour, ...] = (WarmStart(), WIDTHS, STIFFNESSES)
+    stage: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
+
+    def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
+        """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours."""
+        solution = self.direct.solve(objective, guess, retreat)
+        return self.rescued(objective, solution, guess if retreat is None else retreat)
+
+    def rescued(self, objective: Relaxable, solution: Solution, start: Tensor) -> Solution:
+        """The solution of the direct way with its unsolved worlds led along the detours, from `start` `[*batch, nq]`."""
+        for detour in self.detours:
+            index = unsolved_worlds(solution)
+            if len(index) == 0:
+                break
+            part = objective.take(index)
+            climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
+            climbs.append(self.last.solve(part, climbs[-1].q))
+            solution = merged(solution, index, climbs, detour.kind, detour.status)
+        return solution
+
+
+def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int, status: Status) -> Solution:
+    """The solution with the worlds at `index` (of the flattened batch) replaced by the last of `climbs` where that is better, and
+    charged with what all of them cost and with one fallback of this kind."""
+    batch = before.status.shape
+
+    def flat(x: Tensor) -> Tensor:
+        return x.reshape(-1, *x.shape[len(batch) :])
+
+    end = climbs[-1]
+    solved, error = end.solved.reshape(-1), end.residual_norm.reshape(-1)
+    better = solved | (error < flat(before.residual_norm)[index])
+    ended = torch.where(solved, int(status), end.status.reshape(-1))
+
+    def put(old: Tensor, new: Tensor) -> Tensor:
+        rows = flat(old)
+        mask = better.reshape(-1, *(1,) * (rows.ndim - 1))
+        return rows.index_copy(0, index, torch.where(mask, new.reshape(-1, *rows.shape[1:]), rows[index])).reshape(old.shape)
+
+    def charged(old: Tensor, costs: list[Tensor]) -> Tensor:
+        cost = torch.stack([x.reshape(-1) for x in costs]).sum(0, dtype=torch.int32)
+        return flat(old).index_copy(0, index, flat(old)[index] + cost).reshape(old.shape)
+
+    tried = flat(before.fallbacks)[index]
+    tried[:, kind] += 1
+    return Solution(
+        q=put(before.q, end.q),
+        status=put(before.status, ended.to(before.status.dtype)),
+        residual_norm=put(before.residual_norm, end.residual_norm),
+        iterations=charged(before.iterations, [x.iterations for x in climbs]),
+        evaluations=charged(before.evaluations, [x.evaluations for x in climbs]),
+        fallbacks=flat(before.fallbacks).index_copy(0, index, tried).reshape(before.fallbacks.shape),
+        lanes=before.lanes + sum(x.lanes for x in climbs),
+    )
