@@ -71,7 +71,7 @@ class BalanceObjective:
     def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
         """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`; the rounding is that of inertia and of what the Jacobian makes of
         coordinates that are rounded themselves: stiff friction feels a displacement of ε|x|."""
-        epsilon = 4 * torch.finfo(self.scale.dtype).eps
+        epsilon = 2 * torch.finfo(self.scale.dtype).eps
         felt = (evaluation.jacobian.abs() * self.extent[..., None, :]).sum(-1)
         return weighted_error(evaluation.residual, self.scale, self.rounding + epsilon * felt, tolerance)
 

@@ -86,7 +86,7 @@ class Newton(_Root):
     Newton's step is that of JTJ-LM, (JᵀJ + λ1)⁻¹Jᵀr (Eq. 14), for λ → 0, taken from an LU factorisation of J itself: forming JᵀJ
     would square its condition number, and half the digits would be lost. It knows no damping."""
 
-    exact: int = 12
+    exact: int = 8
 
     def model(self, objective: Objective, evaluation: Evaluation, previous: Model | None, step: Tensor, restart: Tensor) -> Model:
         """(r, J, K, scale, whether J is to be trusted, steps taken so far)."""

@@ -342,7 +342,7 @@ def test_backtracking_satisfies_armijo(direction: Direction, name: str) -> None:
 
 def test_damping_falls_and_rises() -> None:
     """λ: a tenth where the model keeps its promise, tenfold where the merit rises or is NaN, fourfold where little of the promise
-    is kept, the same between; a rejected world is stalled once λ exceeds the largest."""
+    is kept, the same between and where nothing changes; a rejected world is stalled once λ exceeds the largest."""
     n = 6
     search, rule = TrustRegion(), Lm()
     one = torch.ones(n, 1, dtype=torch.float64)
@@ -358,7 +358,7 @@ def test_damping_falls_and_rises() -> None:
     verdict, after = search.judge(memory, trial)
     assert verdict.good.tolist() == [True, True, True, False, False, True]
     factors = (after.damping / memory.damping).tolist()
-    assert factors == pytest.approx([0.1, 1.0, 4.0, 10.0, 10.0, 0.1])
+    assert factors == pytest.approx([0.1, 1.0, 4.0, 10.0, 10.0, 1.0])
     assert not bool(verdict.stalled.any())
     for _ in range(20):
         verdict, after = search.judge(after, trial)

@@ -125,7 +125,6 @@ ROOT_LIMITS = {("three links landing", "L-BFGS on GE"): FLAT, ("ten links landin
 ENERGY_LIMITS = {
     ("two links landing", "JTJ-LM"): SHALLOW,
     ("three links landing", "JTJ-LM"): SHALLOW,
-    ("three links landing", "L-BFGS on GE"): FLAT,
     ("ten links landing", "L-BFGS on GE"): FLAT,
     ("ten links landing", "L-BFGS"): MANY,
 }
