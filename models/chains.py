@@ -16,7 +16,7 @@ from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Point
 from pbfd_torch.dynamics import momentum
-from pbfd_torch.kinematics import place, pose_rates
+from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models.setup import Metric, Setup, repeated, tilted
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Scene
@@ -157,7 +157,7 @@ def _margin(setup: Setup, rollout: Rollout) -> Tensor:
     < 0: too much friction. For any motion with ẋ, ż at the start, x − x0 − ẋT ≥ ½ g (sin − μ cos) T² − μ (z − z0 − żT)."""
     duration = rollout.time[-1]
     placement = place(setup.scene.articulation, setup.q)
-    rates, _ = pose_rates(placement, setup.v)
+    rates = Motion(placement, setup.v).rates
     velocity = momentum(placement, rates)[0] / setup.scene.articulation.mass.sum()
     beyond = rollout.center_of_mass[-1] - rollout.center_of_mass[0] - duration * velocity
     return beyond[:, 0] - 0.5 * SLIDE * duration**2 + SLOPE_FRICTION * beyond[:, 2]
@@ -182,9 +182,12 @@ def chain_slope(worlds: int = 1, dtype: torch.dtype = torch.float64, device: tor
 
 
 def chain_slope_drop(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
-    """Pitched by 20°, downhill end first, dropped from 0.1 m onto the slope of 30°, μ = .3."""
+    """Pitched by 20°, uphill end first, dropped from 0.1 m onto the slope of 30°, μ = .3.
+
+    (Downhill end first it folds up as it lands; at Δt = 0.05 its tail then hops for a step, and it arrives 0.2–0.4 m further than
+    sliding all the way would take it.)"""
     scene = _scene("chain-slope-drop", dtype, device, free=True, mu=SLOPE_FRICTION, slope=SLOPE)
-    q = _placed(scene, worlds, math.radians(20), 0.1)
+    q = _placed(scene, worlds, -math.radians(20), 0.1)
     return Setup(
         scene, q, _no_velocity(scene, q), 10.0, 0.05, lambda setup, rollout: {"coulomb_margin_m": _margin(setup, rollout).tolist()}
     )

@@ -7,7 +7,9 @@ A is how the forces answer a motion; B is how the motion axes turn under forces 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+import operator
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import torch
@@ -18,14 +20,15 @@ from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.load import JointLoad, LinkLoad, Load
 
 
-def subtree_sums(placement: Placement, loads: Sequence[LinkLoad]) -> tuple[Tensor, Tensor]:
-    """Sums of `moment` and `stiffness` over everything each joint moves: `[*batch, njoint, 3, 4]`, `[*batch, njoint, 6, 6]`."""
-    moment, stiffness = loads[0].moment, loads[0].stiffness
-    for load in loads[1:]:
-        moment, stiffness = moment + load.moment, stiffness + load.stiffness
-    mask = placement.articulation.topology.subtree.to(moment.dtype)
-    mask = mask.expand(*moment.shape[:-3], *mask.shape)
-    return (mask @ moment.flatten(-2)).unflatten(-1, (3, 4)), (mask @ stiffness.flatten(-2)).unflatten(-1, (6, 6))
+def subtree_sum(placement: Placement, of_links: Tensor) -> Tensor:
+    """Sum over all links that each joint moves, `[*batch, nlink, r, c] → [*batch, njoint, r, c]`."""
+    mask = placement.articulation.topology.subtree.to(of_links.dtype)
+    mask = mask.expand(*of_links.shape[:-3], *mask.shape)
+    return (mask @ of_links.flatten(-2)).unflatten(-1, of_links.shape[-2:])
+
+
+def _total(values: Iterable[Tensor]) -> Tensor:
+    return functools.reduce(operator.add, values)
 
 
 def link_residual(placement: Placement, moment: Tensor) -> Tensor:
@@ -37,12 +40,15 @@ def link_residual(placement: Placement, moment: Tensor) -> Tensor:
 class Balance:
     """The balance of a sum of loads, of which at least one is on links. The matrices are assembled when first asked for.
 
-    residual: r `[*batch, nv]` [N, N m]; zero where Newton's law holds at the end of the step."""
+    placement, loads: where, and of what. residual: r `[*batch, nv]` [N, N m], zero where Newton's law holds at the end of the
+    step."""
 
     def __init__(self, placement: Placement, loads: Sequence[Load]) -> None:
-        self._placement = placement
+        self.placement = placement
+        self.loads = loads
         self._on_joints = [x for x in loads if isinstance(x, JointLoad)]
-        self._moment, self._stiffness = subtree_sums(placement, [x for x in loads if isinstance(x, LinkLoad)])
+        self._on_links = [x for x in loads if isinstance(x, LinkLoad)]
+        self._moment = subtree_sum(placement, _total(x.moment for x in self._on_links))
         self.residual = link_residual(placement, self._moment)
         for load in self._on_joints:
             self.residual = self.residual + load.residual
@@ -50,9 +56,9 @@ class Balance:
     @cached_property
     def stiffness(self) -> Tensor:
         """The part of J without the curvature of the tree (B = 0), `[*batch, nv, nv]`."""
-        t, axes = self._placement.articulation.topology, self._placement.axes
+        t, axes = self.placement.articulation.topology, self.placement.axes
         column = axes[..., None]
-        summed = self._stiffness[..., t.dof_joint, :, :]
+        summed = subtree_sum(self.placement, _total(x.stiffness for x in self._on_links))[..., t.dof_joint, :, :]
         below = (summed @ column).squeeze(-1)  # A s_j: j moves, the rows at or above j feel it
         above = (summed.mT @ column).squeeze(-1)  # Aᵀ s_j: something above moves, row j feels it
         upper = (t.above | t.same_joint).to(axes.dtype)
@@ -65,7 +71,7 @@ class Balance:
     @cached_property
     def jacobian(self) -> Tensor:
         """J = ∂r/∂θ `[*batch, nv, nv]`, exact, in the exponential chart at q; not symmetric once there is friction."""
-        t, axes = self._placement.articulation.topology, self._placement.axes
+        t, axes = self.placement.articulation.topology, self.placement.axes
         omega, v = axes[..., :3], axes[..., 3:]
         first = self._moment[..., :3][..., t.dof_joint, :, :]
         force = self._moment[..., 3][..., t.dof_joint, :]

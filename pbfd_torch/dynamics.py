@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance, link_residual, subtree_sums
-from pbfd_torch.kinematics import Placement, place, pose_rates
+from pbfd_torch.assembly import Balance, link_residual, subtree_sum
+from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.inertia import inertia_stiffness
 from pbfd_torch.terms.joint_springs import Armature
@@ -27,31 +27,21 @@ def armature_diagonal(articulation: Articulation, terms: Sequence[Term]) -> Tens
 
 def mass_matrix(articulation: Articulation, q: Tensor, terms: Sequence[Term] = ()) -> Tensor:
     """Joint-space mass matrix M(q) `[*batch, nv, nv]`; `terms` may hold armatures, which add to its diagonal."""
-    return mass_matrix_at(place(articulation, q), terms)
-
-
-def mass_matrix_at(placement: Placement, terms: Sequence[Term] = ()) -> Tensor:
-    """As `mass_matrix`, of an articulation that is placed already."""
-    second = placement.poses @ placement.articulation.pseudo_inertia @ placement.poses.mT
+    placement = place(articulation, q)
+    second = placement.poses @ articulation.pseudo_inertia @ placement.poses.mT
     still = torch.zeros_like(second[..., :3, :])
-    inertia = Balance(placement, [LinkLoad(still, inertia_stiffness(second))]).stiffness
-    return inertia + torch.diag_embed(armature_diagonal(placement.articulation, terms))
-
-
-def _acceleration_load(placement: Placement, acceleration: Tensor) -> LinkLoad:
-    """Load of inertia for given second derivatives of the link poses `[*batch, nlink, 3, 4]`."""
-    moment = acceleration @ (placement.poses @ placement.articulation.pseudo_inertia).mT
-    return LinkLoad(moment, moment.new_zeros((*moment.shape[:-2], 6, 6)))
+    inertia = Balance(placement, [LinkLoad(still, lambda: inertia_stiffness(second))]).stiffness
+    return inertia + torch.diag_embed(armature_diagonal(articulation, terms))
 
 
 def bias_force(articulation: Articulation, q: Tensor, v: Tensor, gravity: Tensor) -> Tensor:
     """Coriolis, centrifugal and gravity forces h(q, v) `[*batch, nv]` in M v̇ + h = τ; gravity `[*, 3]` [m/s²]."""
     placement = place(articulation, q)
-    _, drift = pose_rates(placement, v)
+    drift = Motion(placement, v).accelerations
     fall = torch.zeros_like(drift)
     fall[..., 3] = gravity[..., None, :]
-    moment, _ = subtree_sums(placement, [_acceleration_load(placement, drift - fall)])
-    return link_residual(placement, moment)
+    moment = (drift - fall) @ (placement.poses @ placement.articulation.pseudo_inertia).mT
+    return link_residual(placement, subtree_sum(placement, moment))
 
 
 def inverse_dynamics(

@@ -116,35 +116,58 @@ def link_jacobians(placement: Placement) -> Tensor:
     return placement.axes.mT[..., None, :, :] * moves[:, None, :]
 
 
-def link_twists(placement: Placement, v: Tensor) -> Tensor:
-    """World twists (ω, v at the world origin) of all links at velocity v `[*batch, nv]`: `[*batch, nlink, 6]`."""
-    moves = placement.articulation.topology.moves_link.to(placement.q.dtype)
-    return moves.expand(*v.shape[:-1], *moves.shape) @ (placement.axes * v[..., None])
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """An articulation that moves from a placement with velocity v `[*batch, nv]` and no generalised acceleration."""
+
+    placement: Placement
+    v: Tensor
+
+    @cached_property
+    def twists(self) -> Tensor:
+        """World twists V = (ω, v at the world origin) of all links `[*batch, nlink, 6]`."""
+        return self._of_links(self.placement.axes * self.v[..., None])
+
+    @cached_property
+    def drifts(self) -> Tensor:
+        """How the twists change, V̇ = Σ ṡ_i v_i with ṡ_i = ad(V_carrier) s_i, `[*batch, nlink, 6]`."""
+        axes = self.placement.axes
+        carriers = self.placement.articulation.topology.carries.T.to(self.v.dtype)
+        # not by a matrix product, which in float32 rounds differently for one world and for many
+        carrier = (carriers[..., None] * (axes * self.v[..., None])[..., None, :, :]).sum(-2)
+        turned = torch.linalg.cross(carrier[..., :3], axes[..., :3])
+        moved = torch.linalg.cross(carrier[..., :3], axes[..., 3:]) + torch.linalg.cross(carrier[..., 3:], axes[..., :3])
+        return self._of_links(torch.cat((turned, moved), -1) * self.v[..., None])
+
+    def _of_links(self, of_dofs: Tensor) -> Tensor:
+        """Sums over the degrees of freedom that move each link."""
+        moves = self.placement.articulation.topology.moves_link.to(of_dofs.dtype)
+        return moves.expand(*of_dofs.shape[:-2], *moves.shape) @ of_dofs
+
+    @cached_property
+    def velocities(self) -> Tensor:
+        """[V], which takes a point of a link to its velocity, `[*batch, nlink, 3, 4]`."""
+        return _hat(self.twists)
+
+    @cached_property
+    def changes(self) -> Tensor:
+        """[V̇] + [V]², which takes a point of a link to its acceleration, `[*batch, nlink, 3, 4]`."""
+        return _hat(self.drifts) + skew(self.twists[..., :3]) @ self.velocities
+
+    @cached_property
+    def rates(self) -> Tensor:
+        """Ṫ = [V]T of all link poses `[*batch, nlink, 3, 4]`."""
+        return self.velocities @ self.placement.poses
+
+    @cached_property
+    def accelerations(self) -> Tensor:
+        """T̈ = ([V̇] + [V]²)T of all link poses `[*batch, nlink, 3, 4]`."""
+        return self.changes @ self.placement.poses
 
 
-def pose_rates(placement: Placement, v: Tensor) -> tuple[Tensor, Tensor]:
-    """First derivative of all link poses, and the second one at zero generalised acceleration, each `[*batch, nlink, 3, 4]`.
-
-    With the twist V of a link Ṫ = [V]T, and T̈ = ([V̇] + [V]²)T, where V̇ = Σ ṡ_i v_i and ṡ_i = ad(V_carrier) s_i."""
-    t = placement.articulation.topology
-    axes = placement.axes
-    moving = axes * v[..., None]
-    carriers = t.carries.T.to(v.dtype)
-    carrier = carriers.expand(*v.shape[:-1], *carriers.shape) @ moving
-    rate = torch.cat(
-        (
-            torch.linalg.cross(carrier[..., :3], axes[..., :3]),
-            torch.linalg.cross(carrier[..., :3], axes[..., 3:]) + torch.linalg.cross(carrier[..., 3:], axes[..., :3]),
-        ),
-        -1,
-    )
-    moves = t.moves_link.to(v.dtype)
-    drift = moves.expand(*v.shape[:-1], *moves.shape) @ (rate * v[..., None])
-    twist = link_twists(placement, v)
-    velocity = torch.cat((skew(twist[..., :3]), twist[..., 3:, None]), -1) @ placement.poses
-    turn = skew(twist[..., :3])
-    second = torch.cat((skew(drift[..., :3]), drift[..., 3:, None]), -1) @ placement.poses + turn @ velocity
-    return velocity, second
+def _hat(twist: Tensor) -> Tensor:
+    """[V] without its row of zeros, `[*, 6] → [*, 3, 4]`."""
+    return torch.cat((skew(twist[..., :3]), twist[..., 3:, None]), -1)
 
 
 def retract(articulation: Articulation, q: Tensor, delta: Tensor) -> Tensor:

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, force_scale, reach
 from pbfd_torch.assembly import Balance
-from pbfd_torch.dynamics import armature_diagonal, mass_matrix_at
+from pbfd_torch.dynamics import armature_diagonal
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement, place, retract
+from pbfd_torch.outlook import Outlook
 from pbfd_torch.solvers.objective import Evaluation, weighted_error
 from pbfd_torch.terms.load import Frictional, Load, OneSided, Potential, StepContext, Term
 from pbfd_torch.worlds import Worlds
@@ -54,11 +55,6 @@ class BalanceObjective:
         """`[*batch, nq]` where inertia alone would end the step."""
         return self.step.target_q
 
-    @cached_property
-    def metric(self) -> Tensor:
-        """κ M(θ_n) `[*batch, nv, nv]`: how inertia alone would resist a step."""
-        return self.step.weight[..., None, None] * mass_matrix_at(self.step.previous, self.terms)
-
     def loads(self, placement: Placement) -> list[Load]:
         """Every term's load at a placement."""
         return [term.load(prepared, placement) for term, prepared in zip(self.terms, self.prepared, strict=True)]
@@ -67,6 +63,10 @@ class BalanceObjective:
         """Residual, Jacobian and stiffness at q."""
         placement = place(self.articulation, q)
         return Balance(placement, self.loads(placement))
+
+    def outlook(self, evaluation: Balance, direction: Tensor) -> Outlook:
+        """What the work along a direction `[*batch, nv]` from an evaluated point is going to be."""
+        return Outlook(self.terms, self.prepared, evaluation, direction)
 
     def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
         """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`; the rounding is that of inertia and of what the Jacobian makes of
@@ -154,7 +154,7 @@ class Energy(Balance):
     @cached_property
     def value(self) -> Tensor:
         """E [J] `[*batch]`."""
-        return self._objective.energy(self._placement)
+        return self._objective.energy(self.placement)
 
 
 def inertia_rounding(articulation: Articulation, terms: Sequence[Term], step: StepContext, far: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
-from pbfd_torch.kinematics import Placement, place, pose_rates
+from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
@@ -86,7 +86,7 @@ class Scene:
     def energy(self, q: Tensor, v: Tensor) -> Tensor:
         """Kinetic plus stored energy [J] `[*batch]` at q `[*batch, nq]` and velocity v `[*batch, nv]`."""
         placement = place(self.articulation, q)
-        rates, _ = pose_rates(placement, v)
+        rates = Motion(placement, v).rates
         return (
             kinetic_energy(self.articulation, rates)
             + rotor_energy(self.articulation, v, self.terms)

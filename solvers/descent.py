@@ -50,7 +50,6 @@ class Descent:
         float64, 1e-3 in float32.
     max_evaluations: evaluations of the residual before a world is given up.
     max_turn: largest rotation of a joint in one step [rad].
-    careful_turn, careful_after: the same once a world has taken so many steps without arriving.
     retreat_above: where ‖r/scale‖₂ at the guess exceeds this, the retreat is taken for it.
     """
 
@@ -59,8 +58,6 @@ class Descent:
     tolerance: float | None = None
     max_evaluations: int = 400
     max_turn: float = 1.0
-    careful_turn: float = 0.2
-    careful_after: int = 8
     retreat_above: float = 2.0
 
     def solve(self, objective: Objective, guess: Tensor, retreat: Tensor | None = None) -> Solution:
@@ -116,8 +113,7 @@ class Descent:
         # linear solvers leave columns in memory, and sums over those round differently for one world and for many
         direction = self.direction.step(model, memory.damping).contiguous()
         steps = p.iterations + (accept & searching).to(torch.int32)
-        limit = torch.where(steps < self.careful_after, self.max_turn, min(self.max_turn, self.careful_turn)).to(direction.dtype)
-        direction = direction * (limit / torch.maximum(objective.turn(direction), limit))[..., None]
+        direction = direction * (self.max_turn / objective.turn(direction).clamp_min(self.max_turn))[..., None]
         memory = self.search.aim(memory, Trial(objective, self.direction, evaluation, model, direction), accept)
 
         q = _where(accept, p.trial, p.q)

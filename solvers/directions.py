@@ -79,29 +79,22 @@ class _Minimum:
 
 @dataclass(frozen=True)
 class Newton(_Root):
-    """Newton's step −J⁻¹r where it descends (r·d < 0), else the stiffness' step −K⁻¹r, else the residual over K's diagonal. After
-    `exact` steps it is still trusted only where inertia outweighs the curvature J − K, that is where M + J − K is positive definite
-    (M: the metric): a chain that is pushed together has many folded solutions, and Newton's steps lead from saddle to saddle.
+    """Newton's step −J⁻¹r where det J > 0 and the step descends (r·d < 0), else the stiffness' step −K⁻¹r.
+
+    The balance that inertia alone would find has det J > 0, and so has every one that follows from it as the step grows, until
+    J turns singular. Roots with det J < 0 are saddles, and Newton's steps lead there as readily as to minima, downhill or not: a
+    chain that is pushed together, or that turns by a radian a step, has many. The determinant holds where friction makes the
+    symmetric part of J indefinite at the very solution.
 
     Newton's step is that of JTJ-LM, (JᵀJ + λ1)⁻¹Jᵀr (Eq. 14), for λ → 0, taken from an LU factorisation of J itself: forming JᵀJ
     would square its condition number, and half the digits would be lost. It knows no damping."""
 
-    exact: int = 8
-
-    def model(self, objective: Objective, evaluation: Evaluation, previous: Model | None, step: Tensor, restart: Tensor) -> Model:
-        """(r, J, K, scale, whether J is to be trusted, steps taken so far)."""
-        model = super().model(objective, evaluation, previous, step, restart)
-        curvature = model[1] - model[2]
-        _, indefinite = torch.linalg.cholesky_ex((objective.metric + 0.5 * (curvature + curvature.mT)).nan_to_num())
-        taken = torch.zeros_like(indefinite) if previous is None else torch.where(restart, 0, previous[5] + 1)
-        return *model, (indefinite == 0) | (taken < self.exact), taken
-
     def step(self, model: Model, damping: Tensor) -> Tensor:
         """See `Direction`."""
-        r, jacobian, stiffness, _, trusted, _ = model
-        steps, _ = torch.linalg.solve_ex(torch.stack((jacobian, stiffness)), torch.stack((-r, -r)))
-        newton, convex = steps.unbind(0)
-        first = torch.where(trusted[..., None], newton, convex)
+        r, jacobian, stiffness, _ = model
+        factor, pivots, _ = torch.linalg.lu_factor_ex(torch.stack((jacobian, stiffness)))
+        newton, convex = torch.linalg.lu_solve(factor, pivots, torch.stack((-r, -r))[..., None]).squeeze(-1).unbind(0)
+        first = torch.where((_determinant_sign(factor[0], pivots[0]) > 0)[..., None], newton, convex)
         return _first_descending(r, first, convex, newton, _scaled(r, stiffness))
 
 
@@ -176,6 +169,12 @@ def projected(jacobian: Tensor) -> Tensor:
     floor = torch.finfo(values.dtype).eps ** 0.5 * values.abs().amax(-1, keepdim=True)
     lifted = torch.maximum(values.abs(), floor)
     return jacobian + (vectors * (lifted - values)[..., None, :]) @ vectors.mT
+
+
+def _determinant_sign(factor: Tensor, pivots: Tensor) -> Tensor:
+    """1, 0 or −1 (NaN stays NaN) `[*batch]`, of an LU factorisation with its row exchanges."""
+    swapped = pivots != torch.arange(1, pivots.shape[-1] + 1, dtype=pivots.dtype, device=pivots.device)
+    return factor.diagonal(dim1=-2, dim2=-1).sign().prod(-1) * (1 - 2 * (swapped.sum(-1) % 2))
 
 
 def _positive_diagonal(matrix: Tensor) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -64,11 +65,6 @@ class Objective(Protocol):
         """Size of a residual entry that counts as one, broadcastable to `[*batch, n]`."""
         ...
 
-    @property
-    def metric(self) -> Tensor:
-        """A positive definite matrix `[n, n]` or `[*batch, n, n]` that measures steps: what of the Jacobian is always there."""
-        ...
-
     def evaluate(self, q: Tensor) -> Evaluation:
         """Residual and Jacobian at q `[*batch, nq]`."""
         ...
@@ -88,6 +84,15 @@ class Objective(Protocol):
 
     def take(self, index: Tensor) -> Self:
         """The problems of some worlds only: positions `[m]` in the flattened batch; the result has batch shape `[m]`."""
+        ...
+
+
+@runtime_checkable
+class Foreseeing(Protocol):
+    """An objective that can tell, for much less than evaluations, how a direction will go."""
+
+    def outlook(self, evaluation: Any, direction: Tensor) -> Callable[[Tensor], Tensor]:
+        """An estimate of the work r(q ⊕ a·d)·d from an evaluated point, as a function of lengths a: `[k, *batch] → [k, *batch]`."""
         ...
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.directions import Direction, Model, times
-from pbfd_torch.solvers.objective import Evaluation, Objective
+from pbfd_torch.solvers.objective import Evaluation, Foreseeing, Objective, weighted_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,56 @@ class Bracket(Memory):
         return dataclasses.replace(self, **{k: torch.where(where, v, getattr(self, k)) for k, v in changes.items()})
 
 
+class FirstLength(Protocol):
+    """Which length to try first."""
+
+    def length(self, start: Trial) -> Tensor:
+        """At most 1, `[*batch]`, for a step that sets out from `start`."""
+        ...
+
+
+@dataclass(frozen=True)
+class FullStep:
+    """The whole step."""
+
+    def length(self, start: Trial) -> Tensor:
+        """See `FirstLength`."""
+        return torch.ones_like(start.work)
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """The first zero of the work that the objective expects along the direction; the whole step where it expects none, and where
+    it cannot tell. `samples` lengths at once, evenly spaced, then as many in the interval in which the sign changes, `rounds`
+    times, and a straight line at last; never below `shortest`."""
+
+    samples: int = 8
+    rounds: int = 3
+    shortest: float = 1e-4
+
+    def length(self, start: Trial) -> Tensor:
+        """See `FirstLength`."""
+        work = start.work
+        full = torch.ones_like(work)
+        if not isinstance(start.objective, Foreseeing):
+            return full
+        outlook = start.objective.outlook(start.evaluation, start.direction)
+        share = torch.linspace(0, 1, self.samples + 1, dtype=work.dtype, device=work.device)[1:].reshape(-1, *[1] * work.ndim)
+        low, high, low_work, high_work = torch.zeros_like(work), full, work, torch.zeros_like(work)
+        passed = torch.zeros_like(work, dtype=torch.bool)
+        for _ in range(self.rounds):
+            lengths = low + share * (high - low)
+            works = outlook(lengths)
+            before = (works < 0).to(torch.int64).cumprod(0).sum(0)  # how many samples lie before the first one past the zero
+            passed = passed | (before < self.samples)
+            end = before.clamp_max(self.samples - 1)[None]
+            lengths, works = torch.cat((low[None], lengths)), torch.cat((low_work[None], works))
+            low, low_work = lengths.gather(0, end)[0], works.gather(0, end)[0]
+            high, high_work = lengths.gather(0, end + 1)[0], works.gather(0, end + 1)[0]
+        zero = low + (low_work / (low_work - high_work)).nan_to_num(0.5).clamp(0, 1) * (high - low)
+        return torch.where(passed, zero.clamp_min(self.shortest), full)
+
+
 class Interpolation(Protocol):
     """Where in a bracket of the work's zero to try next."""
 
@@ -152,6 +202,7 @@ class WorkSearch:
     near side leaves a new contact just out of touch, and the search zigzags.)"""
 
     overshoot: float = 0.5
+    first: FirstLength = field(default_factory=Foreseen)
     interpolation: Interpolation = field(default_factory=Touching)
 
     def begin(self, like: Tensor) -> Bracket:
@@ -164,7 +215,7 @@ class WorkSearch:
         work, zero = start.work, torch.zeros_like(start.work)
         return memory.merged(
             where,
-            length=zero + 1,
+            length=self.first.length(start),
             start_work=work,
             low=zero,
             low_work=work,
@@ -242,7 +293,7 @@ class Trust(Memory):
 @dataclass(frozen=True)
 class TrustRegion:
     """Damping instead of shortening: a step is good if the merit falls by a share of what the model promised; λ grows where it
-    does not and shrinks where the promise is kept."""
+    does not and shrinks where the promise is kept. Promises too small to be seen in the merit are kept if ‖r/scale‖ falls."""
 
     accept_above: float = 1e-4
     first_damping: float = 1e-6
@@ -262,12 +313,14 @@ class TrustRegion:
         """See `Search`."""
         merit = trial.merit
         gained = torch.where(torch.isfinite(merit), memory.merit - merit, -math.inf)
-        slack = 8 * torch.finfo(merit.dtype).eps * memory.merit.abs()  # as in Backtracking
-        level = gained.abs() <= slack
         ratio = gained / memory.promised
-        good = (ratio >= self.accept_above) | level
-        grown = torch.where(good, torch.where(ratio < 0.25, 4.0, 1.0), 10.0)
-        # where differences of merits are rounding, they say nothing about the damping
-        factor = torch.where(level, 1.0, torch.where(ratio > 0.75, 0.1, grown))
+        grown = torch.where(ratio >= self.accept_above, torch.where(ratio < 0.25, 4.0, 1.0), 10.0)
+        factor = torch.where(ratio > 0.75, 0.1, grown)
+        # where the promise is as small as the rounding of merits, their difference says nothing: the residuals do
+        blind = memory.promised <= 64 * torch.finfo(merit.dtype).eps * memory.merit.abs()
+        before, after = (weighted_error(r, trial.objective.scale, 0.0, 1.0) for r in (trial.model[0], trial.evaluation.residual))
+        fell = after < before
+        good = torch.where(blind, fell, ratio >= self.accept_above)
+        factor = torch.where(blind, torch.where(fell, 0.1, 10.0), factor)
         damping = (memory.damping * factor).clamp_min(self.first_damping**2)
         return Verdict(good, damping > self.largest_damping), dataclasses.replace(memory, damping=damping)

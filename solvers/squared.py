@@ -26,11 +26,6 @@ class Squared:
         """That of the roots' residual."""
         return self.roots.scale
 
-    @property
-    def metric(self) -> Tensor:
-        """That of the roots."""
-        return self.roots.metric
-
     def evaluate(self, q: Tensor) -> SquaredEvaluation:
         """Value, gradient and, when asked for, second derivatives at q."""
         return SquaredEvaluation(self.roots, q, self.roots.evaluate(q))

@@ -84,10 +84,6 @@ class FunctionObjective:
     def rounding(self) -> Tensor:
         return torch.zeros_like(self.scale)
 
-    @property
-    def metric(self) -> Tensor:
-        return torch.eye(self.scale.shape[-1], dtype=self.scale.dtype)
-
     def residual(self, row: Tensor) -> Tensor:
         """r at one point `[n]`."""
         if not self.energy:

@@ -57,7 +57,7 @@ class Situation:
 def no_load(placement: Placement) -> LinkLoad:
     """Zero forces on all links."""
     zero = torch.zeros_like(placement.poses[..., :3, :])
-    return LinkLoad(zero, zero.new_zeros((*zero.shape[:-2], 6, 6)))
+    return LinkLoad(zero, lambda: zero.new_zeros((*zero.shape[:-2], 6, 6)))
 
 
 def situation(seed: int, batch: tuple[int, ...] = (), turn: float = 0.1) -> Situation:

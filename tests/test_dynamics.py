@@ -19,7 +19,7 @@ from pbfd_torch.dynamics import (
     potential_energy,
     rotor_energy,
 )
-from pbfd_torch.kinematics import difference, link_jacobians, place, pose_rates, retract
+from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rotations import quaternion_matrix
 from pbfd_torch.simulator import Scene, Simulator
@@ -122,7 +122,7 @@ def test_energy_and_momentum_from_mass_points(seed: int) -> None:
     mass, position = bodies.masses[..., None], bodies.points(q)
     com = (mass * position).sum((0, 1)) / mass.sum()
     placement = place(a, q)
-    rates, _ = pose_rates(placement, v)
+    rates = Motion(placement, v).rates
     linear, angular = momentum(placement, rates)
     energy = 0.5 * (mass * velocity * velocity).sum()
     pairs = [
@@ -147,7 +147,7 @@ def test_power_balance(seed: int) -> None:
 
     def energy(t: Tensor) -> Tensor:
         placement = place(articulation, retract(articulation, q, t * v))  # v̇ enters the kinetic energy only
-        rates, _ = pose_rates(placement, v + t * acceleration)
+        rates = Motion(placement, v + t * acceleration).rates
         return kinetic_energy(articulation, rates) + potential_energy(placement, GRAVITY)
 
     _, power, *_ = torch.func.jvp(energy, (torch.zeros((), dtype=torch.float64),), (torch.ones((), dtype=torch.float64),))
@@ -240,7 +240,7 @@ def test_free_body_by_hand() -> None:
     torch.testing.assert_close(torque[:3], 2.0 * (acceleration[:3] - GRAVITY), rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(torque[3:], spin, rtol=1e-12, atol=1e-12)
     placement = place(body, q)
-    _, angular = momentum(placement, pose_rates(placement, v)[0])
+    _, angular = momentum(placement, Motion(placement, v).rates)
     torch.testing.assert_close(angular, quaternion_matrix(q[3:]) @ inertia @ v[3:], rtol=1e-12, atol=1e-12)
 
 

@@ -241,7 +241,7 @@ def test_bad_widening_is_refused(factor: float) -> None:
 
 
 def test_a_law_without_slip_energy_stays_as_it_is() -> None:
-    """A friction law that has `force` only, as README allows: the contact is not lagged and not widened."""
+    """A friction law without `slip_energy` and `widened`, as README allows: the contact is not lagged and not widened."""
 
     class Viscous:
         def force(
@@ -249,6 +249,9 @@ def test_a_law_without_slip_energy_stays_as_it_is() -> None:
         ) -> tuple[Tensor, Tensor, Tensor]:
             eye = torch.eye(3, dtype=slip.dtype)
             return -normal[..., None] * slip, -normal_slope[..., None] * slip, -normal[..., None, None] * eye
+
+        def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+            return normal
 
         def take(self, worlds: Worlds) -> Self:
             return self

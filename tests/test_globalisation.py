@@ -42,7 +42,7 @@ class Point:
 
 
 def plain(n: int, scale: Tensor | None = None) -> FunctionObjective:
-    """An objective of which only scale and metric matter."""
+    """An objective of which only the scale matters."""
     return FunctionObjective(lambda q, ease: q, torch.ones(n, dtype=torch.float64) if scale is None else scale)
 
 
@@ -342,8 +342,8 @@ def test_backtracking_satisfies_armijo(direction: Direction, name: str) -> None:
 
 def test_damping_falls_and_rises() -> None:
     """λ: a tenth where the model keeps its promise, tenfold where the merit rises or is NaN, fourfold where little of the promise
-    is kept, the same between and where nothing changes; a rejected world is stalled once λ exceeds the largest."""
-    n = 6
+    is kept, the same between; a rejected world is stalled once λ exceeds the largest."""
+    n = 5
     search, rule = TrustRegion(), Lm()
     one = torch.ones(n, 1, dtype=torch.float64)
     objective = plain(1)
@@ -353,17 +353,32 @@ def test_damping_falls_and_rises() -> None:
     memory = search.begin(one[:, 0])
     memory = search.aim(memory, Trial(objective, rule, start, model, direction), torch.ones(n, dtype=torch.bool))
     assert torch.equal(memory.promised, 0.5 * one[:, 0])
-    gained = torch.tensor([0.5, 0.2, 0.05, -1.0, math.nan, 0.0], dtype=torch.float64)
+    gained = torch.tensor([0.5, 0.2, 0.05, -1.0, math.nan], dtype=torch.float64)
     trial = Trial(objective, rule, Point(0 * one, one[..., None], value=10 - gained), model, direction)
     verdict, after = search.judge(memory, trial)
-    assert verdict.good.tolist() == [True, True, True, False, False, True]
+    assert verdict.good.tolist() == [True, True, True, False, False]
     factors = (after.damping / memory.damping).tolist()
-    assert factors == pytest.approx([0.1, 1.0, 4.0, 10.0, 10.0, 1.0])
+    assert factors == pytest.approx([0.1, 1.0, 4.0, 10.0, 10.0])
     assert not bool(verdict.stalled.any())
     for _ in range(20):
         verdict, after = search.judge(after, trial)
     assert verdict.stalled.tolist()[3:5] == [True, True]
     assert float(after.damping[0]) == pytest.approx(1e-12)  # the square of the first
+
+
+def test_promises_below_rounding_are_judged_by_the_residual() -> None:
+    """A step that promises 1e-20 of a merit of 10 is good where ‖r‖ falls, whatever the merit's last digit does."""
+    search, rule = TrustRegion(), Lm()
+    one = torch.ones(2, 1, dtype=torch.float64)
+    start = Point(-1e-10 * one, one[..., None], value=10 * one[:, 0])
+    model = rule.model(plain(1), start, None, 0 * one, torch.ones(2, dtype=torch.bool))
+    direction = rule.step(model, torch.zeros(2, dtype=torch.float64))
+    memory = search.aim(search.begin(one[:, 0]), Trial(plain(1), rule, start, model, direction), one[:, 0] > 0)
+    last_digit = torch.tensor([2e-15, -2e-15], dtype=torch.float64)
+    found = Point(torch.tensor([[1e-11], [1e-9]], dtype=torch.float64), one[..., None], value=10 + last_digit)
+    verdict, after = search.judge(memory, Trial(plain(1), rule, found, model, direction))
+    assert verdict.good.tolist() == [True, False]
+    assert (after.damping / memory.damping).tolist() == pytest.approx([0.1, 10.0])
 
 
 @pytest.mark.parametrize("search", [WorkSearch(), WorkSearch(interpolation=Secant()), Backtracking(), TrustRegion()], ids=str)

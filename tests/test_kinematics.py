@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link, homogeneous
-from pbfd_torch.kinematics import difference, link_jacobians, link_twists, place, pose_rates, retract
+from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
 from pbfd_torch.rotations import quaternion_matrix, skew
 from tests.finite_differences import derivative
 from tests.random_trees import SEEDS, generator, moved_q, random_links, random_q, random_tree
@@ -149,13 +149,13 @@ def test_axes_are_the_derivatives_of_the_poses(seed: int) -> None:
 
 @all_trees
 @all_batches
-def test_twists_and_pose_rates(seed: int, batch: tuple[int, ...]) -> None:
+def test_motion(seed: int, batch: tuple[int, ...]) -> None:
     """Along q(t) = q ⊕ t v: twist = Σ s_i v_i = J v, Ṫ = [twist] T, and T̈ at v̇ = 0, by central differences in t."""
     articulation = random_tree(seed)
     q, v = random_q(articulation, seed, batch), tangent(articulation, seed, batch)
     placement = place(articulation, q)
-    velocity, second = pose_rates(placement, v)
-    twists = link_twists(placement, v)
+    motion = Motion(placement, v)
+    twists, velocity, second = motion.twists, motion.rates, motion.accelerations
     torch.testing.assert_close(twists, (link_jacobians(placement) @ v[..., None, :, None]).squeeze(-1), rtol=0, atol=1e-12)
     torch.testing.assert_close(velocity, twist_matrices(twists) @ placement.poses, rtol=0, atol=1e-12)
 
@@ -163,7 +163,7 @@ def test_twists_and_pose_rates(seed: int, batch: tuple[int, ...]) -> None:
         return place(articulation, retract(articulation, q, t * v)).poses[..., :3, :]
 
     def rates(t: Tensor) -> Tensor:
-        return pose_rates(place(articulation, retract(articulation, q, t * v)), v.expand(*t.shape[:-1], -1))[0]
+        return Motion(place(articulation, retract(articulation, q, t * v)), v.expand(*t.shape[:-1], -1)).rates
 
     assert float((derivative(poses, 1, batch).squeeze(-1) - velocity).abs().max()) <= 1e-9
     scale = float(second.abs().max())
@@ -283,15 +283,15 @@ def test_parameters_may_differ_from_world_to_world(batch: tuple[int, ...], share
     v = tangent(articulation, 6, batch)
     whole = place(many, q)
     assert whole.poses.shape == (*batch, articulation.nlink, 4, 4)
-    rates = pose_rates(whole, v)
+    motion = Motion(whole, v)
     for index in torch.cartesian_prod(*(torch.arange(n) for n in batch)).view(-1, len(batch)).tolist():
         at = tuple(index)
         one = dataclasses.replace(articulation, **{name: value[at] for name, value in changed.items()})
         alone = place(one, q if shared_q else q[at])
         torch.testing.assert_close(whole.poses[at], alone.poses, rtol=0, atol=1e-15)
         torch.testing.assert_close(whole.axes[at], alone.axes, rtol=0, atol=1e-15)
-        for found, expected in zip(rates, pose_rates(alone, v[at]), strict=True):
-            torch.testing.assert_close(found[at], expected, rtol=0, atol=1e-12)
+        torch.testing.assert_close(motion.rates[at], Motion(alone, v[at]).rates, rtol=0, atol=1e-12)
+        torch.testing.assert_close(motion.accelerations[at], Motion(alone, v[at]).accelerations, rtol=0, atol=1e-12)
 
 
 @all_trees

@@ -19,7 +19,7 @@ from pbfd_torch.articulation import pseudo_inertia
 from pbfd_torch.contact.shapes import Point, Sphere
 from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement, place, pose_rates
+from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES, Setup, file_setup, robot_setup
 from pbfd_torch.rollout import Rollout
@@ -234,7 +234,7 @@ def test_free_chain_turns_as_one_rigid_body() -> None:
     a = setup.scene.articulation
     assert not setup.scene.gravity.any()
     placement = start(setup)
-    rates, _ = pose_rates(placement, setup.v)
+    rates = Motion(placement, setup.v).rates
     linear, angular = momentum(placement, rates)
     torch.testing.assert_close(linear, linear.new_tensor([[5.0, 0, 0]]), rtol=0, atol=1e-12)
     moment = 10 * (0.1 * (3 * 0.02**2 + 0.1**2) / 12) + sum(0.1 * (0.1 * k + 0.05 - 0.5) ** 2 for k in range(10))

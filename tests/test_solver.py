@@ -284,7 +284,7 @@ def test_step_length_is_limited_by_rotation() -> None:
 
     objective = Turning(lambda q, ease: q, torch.ones(1, dtype=torch.float64))
     guess = torch.tensor([10.0], dtype=torch.float64)
-    assert int(Descent(max_turn=1.0, careful_turn=1.0).solve(objective, guess).iterations) == 10
+    assert int(Descent(max_turn=1.0).solve(objective, guess).iterations) == 10
     assert int(Descent(max_turn=100.0).solve(objective, guess).iterations) == 1
 
 

@@ -276,7 +276,7 @@ def test_batch_equals_its_worlds(case: TermCase) -> None:
 
 @pytest.mark.parametrize("friction", [CoulombFriction, PbfdFriction], ids=lambda f: f.__name__)
 def test_contact_parameters_may_differ_from_world_to_world(friction: type) -> None:
-    """C⊥ `[*batch]`, μ or C∥ `[*batch, npoint]`, and the pseudo-inertia `[*batch, nlink, 4, 4]`: each world gets its own."""
+    """C⊥ `[*batch, 1]`, μ or C∥ `[*batch, npoint]`, and the pseudo-inertia `[*batch, nlink, 4, 4]`: each world gets its own."""
     s = situation(0, (3,))
     stiffness = torch.tensor([1e3, 1e4, 1e5], dtype=torch.float64)
     share = torch.linspace(0.1, 0.9, 3 * len(contact(s, None).link), dtype=torch.float64).view(3, -1)
@@ -285,7 +285,7 @@ def test_contact_parameters_may_differ_from_world_to_world(friction: type) -> No
         return CoulombFriction(value, 50.0) if friction is CoulombFriction else PbfdFriction.as_printed(1e5 * value)
 
     base = contact(s, None)
-    made = dataclasses.replace(base, normal_force=NormalForce(stiffness), friction=law(share))
+    made = dataclasses.replace(base, normal_force=NormalForce(stiffness[:, None]), friction=law(share))
     mass = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)[:, None, None, None]
     a = dataclasses.replace(s.articulation, pseudo_inertia=mass * s.articulation.pseudo_inertia)
     whole = dataclasses.replace(s, articulation=a).balance([Inertia(), made], s.q)

@@ -149,7 +149,7 @@ class ParameterCase:
 
 
 PARAMETERS = (
-    ParameterCase("C⊥ per world", lambda s, lead: with_law(s, spread(1e4, lead))),
+    ParameterCase("C⊥ per world", lambda s, lead: with_law(s, spread(1e4, lead, (1,)))),
     ParameterCase("C⊥ per candidate", lambda s, lead: with_law(s, spread(1e4, lead, (POINTS,)))),
     ParameterCase("μ per world", lambda s, lead: contact(s, CoulombFriction(spread(0.4, lead, (1,)), 50.0))),
     ParameterCase("μ per candidate", lambda s, lead: contact(s, CoulombFriction(spread(0.4, lead, (POINTS,)), 50.0))),

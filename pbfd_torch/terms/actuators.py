@@ -159,7 +159,7 @@ class Actuators:
         slope = torch.where(inside, self.stiffness + damping, torch.zeros_like(force)) * self.gear * self.gear
         spread = prepared.spread.expand(*placement.q.shape[:-1], *prepared.spread.shape)
         residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
-        return JointLoad(residual, torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
+        return JointLoad(residual, lambda: torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
 
     def energy(self, prepared: PreparedActuators, placement: Placement) -> Tensor:
         """Minus the work of all actuators from x_n on, −Σ ∫ f dx [J] `[*batch]`. The force before its limits, F(x), falls in a

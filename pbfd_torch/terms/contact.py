@@ -8,7 +8,7 @@ acts at c − ρn, and its slip over the step is u = (I − nnᵀ)[(c − c_n) �
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, Self
@@ -21,7 +21,7 @@ from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.kinematics import Motion, Placement
 from pbfd_torch.rotations import log_jacobian_left, quaternion_matrix, rotation_log, skew
 from pbfd_torch.terms.lagged_friction import LaggedFriction, SlipLaw
 from pbfd_torch.terms.load import LinkLoad, StepContext
@@ -34,6 +34,10 @@ class FrictionLaw(Protocol):
 
     def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Force, d force/d depth, d force/d slip from N, dN/dd, d `[*, n]`, u `[*, n, 3]` and dt (broadcastable to `[*, n]`)."""
+        ...
+
+    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+        """g ≥ 0 `[*, n]`, where the force is −g u, from N, d and ‖u‖ `[*, n]`."""
         ...
 
     def take(self, worlds: Worlds) -> Self:
@@ -128,14 +132,22 @@ class Contact:
 
     def __post_init__(self) -> None:
         zero = torch.zeros_like(self.radius)[None]
+        count = len(self.radius)
         try:
+            shape = self.normal_force.force(zero)[0].shape
             if self.friction is not None:
-                self.friction.force(zero, zero, zero, zero[..., None].expand(-1, -1, 3), torch.ones_like(zero))
+                force, _, _ = self.friction.force(zero, zero, zero, zero[..., None].expand(-1, -1, 3), torch.ones_like(zero))
+                shape = torch.broadcast_shapes(shape, force.shape[:-1])
         except RuntimeError as error:
             raise InputError(
-                f"a parameter of the friction law does not fit the {len(self.radius)} candidates: must be one number or end in "
-                f"({len(self.radius)},): {error}"
+                f"a parameter of the normal force or the friction does not fit the {count} candidates: must be one number or end "
+                f"in ({count},), or (1,) where each world has its own: {error}"
             ) from error
+        if shape[-1] != count:
+            raise InputError(
+                f"a parameter of the normal force or the friction has {shape[-1]} entries for {count} candidates: must be one "
+                f"number or end in ({count},), or (1,) where each world has its own"
+            )
 
     @cached_property
     def rounded(self) -> bool:
@@ -143,8 +155,7 @@ class Contact:
         return bool((self.radius > 0).any())
 
     def _centers(self, placement: Placement) -> Tensor:
-        poses = placement.poses[..., self.link, :3, :]
-        return (poses[..., :3] @ self.position[..., None]).squeeze(-1) + poses[..., 3]
+        return _mapped(placement.poses[..., self.link, :3, :], self.position)
 
     def prepare(self, step: StepContext) -> PreparedContact:
         poses = step.previous.poses
@@ -189,40 +200,70 @@ class Contact:
         push, push_slope = self.normal_force.force(depth)
         force = push[..., None] * normal
         by_depth = push_slope[..., None] * normal
-
-        # K: minus the derivative of the force by the link's twist, in its ω and v columns, each [*batch, npoint, 3, 3]
-        if self.friction is None:
-            turned, shifted = _outer(by_depth, torch.linalg.cross(centers, normal)), _outer(by_depth, normal)
-        else:
+        by_slip = None
+        if self.friction is not None:
             slip = self._slip(prepared, placement, centers)
-            drag, drag_by_depth, drag_by_slip = self.friction.force(push, push_slope, depth, slip, prepared.dt)
+            drag, drag_by_depth, by_slip = self.friction.force(push, push_slope, depth, slip, prepared.dt)
             force = force + drag
             by_depth = by_depth + drag_by_depth
-            tangential = drag_by_slip - _outer((drag_by_slip @ normal[..., None]).squeeze(-1), normal)
-            arm = skew(centers)
-            if self.rounded:
-                turning = skew(self.normal)[..., None, :, :] @ log_jacobian_left(self._turn(prepared, placement))
-                arm = arm - self.radius[..., None, None] * turning[..., self.link, :, :]
-            turned = _outer(by_depth, torch.linalg.cross(centers, normal)) + tangential @ arm
-            shifted = _outer(by_depth, normal) - tangential
-
         points = centers - self.radius[..., None] * normal if self.rounded else centers
-        lever = skew(points)
-        twisted = lever @ turned
-        if self.rounded:  # the point of application moves with the centre, not with the surface
-            pull = self.radius[..., None, None] * _outer(normal, force)
-            trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-            twisted = twisted - pull + trace * torch.eye(3, dtype=pull.dtype, device=pull.device)
-
         on_link = prepared.on_link.expand(*force.shape[:-2], *prepared.on_link.shape)
 
         def summed(blocks: Tensor) -> Tensor:
-            return (on_link @ blocks.flatten(-2)).unflatten(-1, (3, 3))
+            return (on_link @ blocks.flatten(-2)).unflatten(-1, blocks.shape[-2:])
 
-        upper = torch.cat((summed(twisted), summed(lever @ shifted)), -1)
-        lower = torch.cat((summed(turned), summed(shifted)), -1)
-        moment = torch.cat((summed(_outer(force, points)), (on_link @ force)[..., None]), -1)
-        return LinkLoad(-moment, torch.cat((upper, lower), -2))
+        def stiffness() -> Tensor:
+            # minus the derivative of the force by the link's twist, in its ω and v columns, each [*batch, npoint, 3, 3]
+            turned, shifted = _outer(by_depth, torch.linalg.cross(centers, normal)), _outer(by_depth, normal)
+            if by_slip is not None:
+                tangential = by_slip - _outer((by_slip @ normal[..., None]).squeeze(-1), normal)
+                arm = skew(centers)
+                if self.rounded:
+                    turning = skew(self.normal)[..., None, :, :] @ log_jacobian_left(self._turn(prepared, placement))
+                    arm = arm - self.radius[..., None, None] * turning[..., self.link, :, :]
+                turned, shifted = turned + tangential @ arm, shifted - tangential
+            lever = skew(points)
+            twisted = lever @ turned
+            if self.rounded:  # the point of application moves with the centre, not with the surface
+                pull = self.radius[..., None, None] * _outer(normal, force)
+                trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+                twisted = twisted - pull + trace * torch.eye(3, dtype=pull.dtype, device=pull.device)
+            upper = torch.cat((summed(twisted), summed(lever @ shifted)), -1)
+            return torch.cat((upper, torch.cat((summed(turned), summed(shifted)), -1)), -2)
+
+        return LinkLoad(-torch.cat((summed(_outer(force, points)), (on_link @ force)[..., None]), -1), stiffness)
+
+    def outlook(self, prepared: PreparedContact, motion: Motion) -> Callable[[Tensor], Tensor]:
+        """Each point of application moves on a parabola, so its depth d and the square of its slip u are polynomials in a; the work
+        is N ḋ + g u·u̇, where friction is −g u."""
+        at = motion.placement
+        centers, normal = self._centers(at), self.normal[..., None, :]
+        velocity = _mapped(motion.velocities[..., self.link, :, :], centers)
+        acceleration = _mapped(motion.changes[..., self.link, :, :], centers)
+        if self.rounded:  # as in the slip: the surface moves by −ρ φ × n beside its centre
+            arm = self.radius[..., None] * normal.expand_as(centers)
+            velocity = velocity - torch.linalg.cross(motion.twists[..., self.link, :3], arm)
+            acceleration = acceleration - torch.linalg.cross(motion.drifts[..., self.link, :3], arm)
+        depth, sinks, sinks_faster = self._depth(centers), -(velocity * normal).sum(-1), -(acceleration * normal).sum(-1)
+        law, dt = self.friction, prepared.dt
+        if law is not None:
+            slip = self._slip(prepared, at, centers)
+            first, second = velocity + sinks[..., None] * normal, acceleration + sinks_faster[..., None] * normal
+            size, along, square = (slip * slip).sum(-1), (slip * first).sum(-1), (first * first + slip * second).sum(-1)
+            cube, fourth = (first * second).sum(-1), (second * second).sum(-1)
+
+        def work(length: Tensor) -> Tensor:
+            a = length[..., None]
+            deep = depth + a * (sinks + 0.5 * a * sinks_faster)
+            push, _ = self.normal_force.force(deep)
+            power = push * (sinks + a * sinks_faster)
+            if law is not None:
+                far = size + a * (2 * along + a * (square + a * (cube + 0.25 * a * fourth)))
+                onward = along + a * (square + a * (1.5 * cube + 0.5 * a * fourth))
+                power = power + law.drag(push, deep, far.clamp_min(0).sqrt(), dt) * onward
+            return power.sum(-1)
+
+        return work
 
     def potential(self, placement: Placement) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
@@ -273,6 +314,11 @@ class Contact:
             force = force + self.friction.force(push, push_slope, depth, slip, prepared.dt)[0]
         point = centers - self.radius[..., None] * self.normal[..., None, :]
         return ContactPoints(point, depth, self.normal, force, slip)
+
+
+def _mapped(matrices: Tensor, points: Tensor) -> Tensor:
+    """M (p, 1), `[*, 3, 4], [*, 3] → [*, 3]`."""
+    return (matrices[..., :3] @ points[..., None]).squeeze(-1) + matrices[..., 3]
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:

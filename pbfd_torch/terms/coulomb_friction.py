@@ -74,6 +74,12 @@ class CoulombFriction:
         by_slip = -(self.mu * normal)[..., None, None] * isotropic_slope(slip, size, factor, slope)
         return force, by_depth, by_slip
 
+    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+        """μ N s(‖u‖) `[*, n]`: the force is minus this times the slip."""
+        inverse = 1 / (self.slip_speed * dt)
+        # as `slip_factor`, whose slope is not asked for here
+        return self.mu * normal * torch.where(size * inverse < 1, (2 - size * inverse) * inverse, 1 / size)
+
     def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """μ N S(‖u‖) [J] `[*, n]` (see `slip_work`): minus its gradient by the slip, with N held still, is the force."""
         return self.mu * normal * slip_work(slip_size(slip), self.slip_speed * dt)

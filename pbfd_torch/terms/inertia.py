@@ -31,7 +31,7 @@ class Inertia:
     def load(self, prepared: PreparedInertia, placement: Placement) -> LinkLoad:
         weighted = (placement.poses @ (prepared.weight * placement.articulation.pseudo_inertia)).mT
         lag = (placement.poses - prepared.target)[..., :3, :]
-        return LinkLoad(lag @ weighted, inertia_stiffness(placement.poses @ weighted))
+        return LinkLoad(lag @ weighted, lambda: inertia_stiffness(placement.poses @ weighted))
 
     def take(self, worlds: Worlds) -> Self:
         """Itself: the masses are the articulation's."""

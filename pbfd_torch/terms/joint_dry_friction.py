@@ -66,6 +66,6 @@ class JointDryFriction:
 def _moved(prepared: PreparedDryFriction, placement: Placement) -> Tensor:
     """Displacement of each hinge and slide over the step `[*batch, nv]`, 0 for other degrees of freedom."""
     t = placement.articulation.topology
-    moved = -prepared.start
-    moved[..., t.scalar_v] = moved[..., t.scalar_v] + placement.q[..., t.scalar_q]
+    moved = placement.q.new_zeros((*placement.q.shape[:-1], t.nv))
+    moved[..., t.scalar_v] = placement.q[..., t.scalar_q] - prepared.start[..., t.scalar_v]
     return moved

@@ -34,14 +34,16 @@ def elastic_load(articulation: Articulation, coefficient: Tensor, rest: Tensor, 
     """Gradient and Hessian of ½ Σ c_i e_i², e = difference(rest, q); rotation vectors keep their exact curvature."""
     t = articulation.topology
     gap = difference(articulation, rest, q)
-    residual = coefficient * gap
-    stiffness = torch.diag_embed(coefficient.expand_as(residual))
-    if len(t.turning_v):
-        rows, columns = t.turning_v[:, :, None], t.turning_v[:, None, :]
-        turning = gap[..., t.turning_v]
-        factor = coefficient[..., t.turning_v[:, :1]].unsqueeze(-1)
-        stiffness[..., rows, columns] = factor * log_jacobian_symmetric(turning)
-    return JointLoad(residual, stiffness)
+
+    def hessian() -> Tensor:
+        stiffness = torch.diag_embed(coefficient.expand_as(gap))
+        if len(t.turning_v):
+            rows, columns = t.turning_v[:, :, None], t.turning_v[:, None, :]
+            factor = coefficient[..., t.turning_v[:, :1]].unsqueeze(-1)
+            stiffness[..., rows, columns] = factor * log_jacobian_symmetric(gap[..., t.turning_v])
+        return stiffness
+
+    return JointLoad(coefficient * gap, hessian)
 
 
 @dataclass(frozen=True, eq=False)

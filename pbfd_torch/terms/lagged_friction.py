@@ -19,6 +19,10 @@ class SlipLaw(Protocol):
         """See `FrictionLaw`."""
         ...
 
+    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+        """See `FrictionLaw`."""
+        ...
+
     def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """The scalar [J] `[*, n]` whose gradient by the slip is minus the force, 0 at zero slip."""
         ...
@@ -45,6 +49,10 @@ class LaggedFriction:
         """Friction force and its derivatives by depth, which is zero, and by slip, shapes as in `CoulombFriction.force`."""
         force, by_depth, by_slip = self.law.force(self.normal, normal_slope, self.depth, slip, dt)
         return force, torch.zeros_like(by_depth), by_slip
+
+    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+        """The law's at the frozen normal force and depth."""
+        return self.law.drag(self.normal, self.depth, size, dt)
 
     def energy(self, slip: Tensor, dt: Tensor) -> Tensor:
         """μ N̂ S(‖u‖) for Coulomb's law, S as in `slip_work`; C∥ (β + 1)/(e + 2) ‖u‖^{e+2} d̂^{γ+1} for the paper's: [J] `[*, n]`."""

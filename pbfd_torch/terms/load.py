@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement, place
+from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.worlds import Worlds
 
 
@@ -45,25 +47,33 @@ class StepContext:
         )
 
 
-@dataclass(frozen=True, eq=False)
 class LinkLoad:
-    """Loads on links, in world coordinates about the world origin.
+    """Loads on links, in world coordinates about the world origin. The stiffness is computed when first asked for.
 
-    Attributes:
-        moment: `[*batch, nlink, 3, 4]` [G | g] of METHOD §3: minus the first moment Σ f p̄ᵀ of the forces [N m | N].
-        stiffness: `[*batch, nlink, 6, 6]` A: how the wrench (torque, force) answers a twist (ω, v) of the link, axes held still.
-    """
+    moment: `[*batch, nlink, 3, 4]` [G | g] of METHOD §3: minus the first moment Σ f p̄ᵀ of the forces [N m | N]."""
 
-    moment: Tensor
-    stiffness: Tensor
+    def __init__(self, moment: Tensor, stiffness: Callable[[], Tensor]) -> None:
+        self.moment = moment
+        self._stiffness = stiffness
+
+    @cached_property
+    def stiffness(self) -> Tensor:
+        """A `[*batch, nlink, 6, 6]`: how the wrench (torque, force) answers a twist (ω, v) of the link, axes held still."""
+        return self._stiffness()
 
 
-@dataclass(frozen=True, eq=False)
 class JointLoad:
-    """Loads on degrees of freedom: `residual` `[*batch, nv]` (minus the generalised force) and `stiffness` `[*batch, nv, nv]`."""
+    """Loads on degrees of freedom: `residual` `[*batch, nv]`, minus the generalised force. The stiffness is computed when first
+    asked for."""
 
-    residual: Tensor
-    stiffness: Tensor
+    def __init__(self, residual: Tensor, stiffness: Callable[[], Tensor]) -> None:
+        self.residual = residual
+        self._stiffness = stiffness
+
+    @cached_property
+    def stiffness(self) -> Tensor:
+        """Its derivative by the degrees of freedom `[*batch, nv, nv]`."""
+        return self._stiffness()
 
 
 Load = LinkLoad | JointLoad
@@ -82,6 +92,16 @@ class Term(Protocol):
 
     def take(self, worlds: Worlds) -> Self:
         """The same effect with the parameters of some worlds."""
+        ...
+
+
+@runtime_checkable
+class Foretelling(Protocol):
+    """A term on links whose forces set in or change abruptly, and that can tell where along a direction they do."""
+
+    def outlook(self, prepared: Any, motion: Motion) -> Callable[[Tensor], Tensor]:
+        """The work r·d [J] of its forces, d the motion's velocity, where links have moved to second order in the length a:
+        `[k, *batch] → [k, *batch]`."""
         ...
 
 
@@ -128,4 +148,4 @@ class Frictional(Protocol):
 
 def diagonal_load(residual: Tensor, stiffness: Tensor) -> JointLoad:
     """A joint load whose stiffness `[*batch, nv]` couples no two degrees of freedom."""
-    return JointLoad(residual, torch.diag_embed(stiffness.expand_as(residual)))
+    return JointLoad(residual, lambda: torch.diag_embed(stiffness.expand_as(residual)))

@@ -31,7 +31,7 @@ def power(base: Tensor, exponent: float) -> Tensor:
 class NormalForce:
     """f⊥ = C⊥ d^α n (Eq. 8), energy C⊥ d^{α+1}/(α+1) (Eq. 9); at rest d = (N/C⊥)^{1/α}.
 
-    `stiffness`: C⊥ [N/m^α] > 0, one number or one per world `[*batch]` (or per candidate `[*batch, npoint]`).
+    `stiffness`: C⊥ [N/m^α] > 0, one number, one per world `[*batch, 1]` or one per candidate `[*batch, npoint]`.
     `exponent`: α > 1, so that the residual is continuously differentiable (what GE needs)."""
 
     stiffness: float | Tensor
@@ -49,15 +49,9 @@ class NormalForce:
         require_positive("penetration", penetration, "m")
         return NormalForce(weight / penetration**exponent, exponent)
 
-    def _coefficient(self, depth: Tensor) -> float | Tensor:
-        if isinstance(self.stiffness, Tensor) and 0 < self.stiffness.ndim < depth.ndim:
-            return self.stiffness[..., None]
-        return self.stiffness
-
     def take(self, worlds: Worlds) -> Self:
         """The same law with the stiffness of some worlds."""
-        per_candidate = isinstance(self.stiffness, Tensor) and self.stiffness.ndim > len(worlds.batch)
-        return replaced(self, stiffness=worlds.pick(self.stiffness, 1 if per_candidate else 0))
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1))
 
     def scaled(self, factor: float) -> NormalForce:
         """The same law with C⊥ scaled by `factor` > 0."""
@@ -66,9 +60,8 @@ class NormalForce:
     def force(self, depth: Tensor) -> tuple[Tensor, Tensor]:
         """N and dN/dd `[*batch, npoint]` at depth d (≤ 0: apart, no force)."""
         d = depth.clamp_min(0)
-        c = self._coefficient(depth)
-        return c * power(d, self.exponent), c * self.exponent * power(d, self.exponent - 1)
+        return self.stiffness * power(d, self.exponent), self.stiffness * self.exponent * power(d, self.exponent - 1)
 
     def energy(self, depth: Tensor) -> Tensor:
         """C⊥ d^{α+1}/(α+1) [J] per candidate."""
-        return self._coefficient(depth) * power(depth.clamp_min(0), self.exponent + 1) / (self.exponent + 1)
+        return self.stiffness * power(depth.clamp_min(0), self.exponent + 1) / (self.exponent + 1)

@@ -76,6 +76,10 @@ class PbfdFriction:
         by_slip = -weight[..., None, None] * isotropic_slope(slip, size, factor, slope)
         return -weight[..., None] * unit, -weight_slope[..., None] * unit, by_slip
 
+    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
+        """C∥ (β + 1) ‖u‖^e d^{γ+1} `[*, n]`: the force is minus this times the slip."""
+        return self.stiffness * (self.beta + 1) * power(depth.clamp_min(0), self.gamma + 1) * power(size, self.slip_exponent)
+
     def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """C∥ (β + 1)/(e + 2) ‖u‖^{e+2} d^{γ+1} [J] `[*, n]`: minus its gradient by the slip, with d held still, is the force. With
         e = β − 1 it is the density of Eq. 11 times C∥."""
