@@ -182,10 +182,9 @@ def chain_slope(worlds: int = 1, dtype: torch.dtype = torch.float64, device: tor
 
 
 def chain_slope_drop(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
-    """Pitched by 20°, uphill end first, dropped from 0.1 m onto the slope of 30°, μ = .3.
-
-    (Downhill end first it folds up as it lands; at Δt = 0.05 its tail then hops for a step, and it arrives 0.2–0.4 m further than
-    sliding all the way would take it.)"""
+    """Pitched by 20°, uphill end first, dropped from 0.1 m onto the slope of 30°, μ = .3."""
+    # Downhill end first it folds up as it lands; at Δt = 0.05 its tail then hops for a step, and it arrives 0.2–0.4 m further than
+    # sliding all the way would take it.
     scene = _scene("chain-slope-drop", dtype, device, free=True, mu=SLOPE_FRICTION, slope=SLOPE)
     q = _placed(scene, worlds, -math.radians(20), 0.1)
     return Setup(

@@ -19,8 +19,9 @@ from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent, renewed
 from pbfd_torch.solvers.fallbacks import Fallbacks
-from pbfd_torch.solvers.lock_step import FEWEST_LANES, mapped, solution
+from pbfd_torch.solvers.lock_step import FEWEST_LANES, solution
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, unsolved_worlds
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.worlds import Worlds
 
 
@@ -123,7 +124,8 @@ class AsynchronousRollout:
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
         if len(unsolved_worlds(found)):
             simulator = self._simulator.take(lanes)
-            found = self._fallbacks.rescued(self._objective.take(index), found, state.q)
+            objective = self._objective.take(index)
+            found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
             advanced, found = simulator.finished(state, held, found)
             self.lanes += found.lanes
         else:

@@ -22,8 +22,8 @@ from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
-from pbfd_torch.solvers.lock_step import mapped
 from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Conservative, Term

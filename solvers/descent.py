@@ -17,6 +17,7 @@ from torch import Tensor
 from pbfd_torch.solvers.directions import Direction, Model, Newton
 from pbfd_torch.solvers.lock_step import lock_step
 from pbfd_torch.solvers.objective import Objective, Solution, Status
+from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.solvers.searches import Memory, Search, Trial, WorkSearch
 
 _AT_GUESS, _AT_RETREAT, _SEARCHING = 0, 1, 2
@@ -106,17 +107,17 @@ class Descent:
         accept = p.running & finite & ~retreating & (~searching | verdict.good | tolerable)
         arrived = accept & tolerable
         stalled = p.running & searching & ~accept & verdict.stalled
-        memory = _chosen(searching, memory, p.memory)
+        memory = chosen(searching, memory, p.memory)
 
         new = self.direction.model(objective, evaluation, p.model, p.memory.length[..., None] * p.direction, ~searching)
-        model = tuple(_where(accept, a, b) for a, b in zip(new, old, strict=True))
+        model = chosen(accept, new, old)
         # linear solvers leave columns in memory, and sums over those round differently for one world and for many
         direction = self.direction.step(model, memory.damping).contiguous()
         steps = p.iterations + (accept & searching).to(torch.int32)
         direction = direction * (self.max_turn / objective.turn(direction).clamp_min(self.max_turn))[..., None]
         memory = self.search.aim(memory, Trial(objective, self.direction, evaluation, model, direction), accept)
 
-        q = _where(accept, p.trial, p.q)
+        q = chosen(accept, p.trial, p.q)
         trial = objective.retract(q, memory.length[..., None] * direction)
         status = torch.where(arrived, int(Status.SOLVED), p.status)
         status = torch.where(stalled, int(Status.STALLED), status)
@@ -124,7 +125,7 @@ class Descent:
         evaluations = p.evaluations + p.running.to(torch.int32)
         return Progress(
             q=q,
-            trial=_where(retreating, p.retreat, trial),
+            trial=chosen(retreating, p.retreat, trial),
             retreat=p.retreat,
             stage=stage.to(torch.int32),
             direction=direction,
@@ -138,26 +139,16 @@ class Descent:
         )
 
 
-def _where(mask: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """torch.where with the mask `[*batch]` spread over the values' own dimensions."""
-    return torch.where(mask.reshape((*mask.shape, *(1,) * (a.ndim - mask.ndim))), a, b)
-
-
-def _chosen(mask: Tensor, a: Memory, b: Memory) -> Memory:
-    fields = {f.name: _where(mask, getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)}
-    return dataclasses.replace(a, **fields)
-
-
 def renewed(progress: Progress, where: Tensor, guess: Tensor, retreat: Tensor, memory: Memory) -> Progress:
     """Worlds in `where` start anew, on another problem, from `guess`; memory: of worlds that have not moved."""
     zero = torch.zeros_like(progress.evaluations)
     return dataclasses.replace(
         progress,
-        q=_where(where, guess, progress.q),
-        trial=_where(where, guess, progress.trial),
-        retreat=_where(where, retreat, progress.retreat),
+        q=chosen(where, guess, progress.q),
+        trial=chosen(where, guess, progress.trial),
+        retreat=chosen(where, retreat, progress.retreat),
         stage=torch.where(where, _AT_GUESS, progress.stage),
-        memory=_chosen(where, memory, progress.memory),
+        memory=chosen(where, memory, progress.memory),
         status=torch.where(where, int(Status.ITERATION_LIMIT), progress.status),
         running=where | progress.running,
         iterations=torch.where(where, zero, progress.iterations),

@@ -62,12 +62,15 @@ class _Root:
         return 0.5 * ((r / scale).square() - after.square()).sum(-1)
 
 
-class _Minimum:
-    """Merit: the value; models are (r, H)."""
+class Minimising:
+    """Merit: the value; models start with (r, H)."""
 
     def merit(self, objective: Objective, evaluation: Evaluation) -> Tensor:
         if not isinstance(evaluation, Valued):
-            raise TypeError("this direction minimises a value, and the objective has none: use a root direction, or an energy")
+            raise TypeError(
+                "this direction minimises a value, and the objective has none: use a root direction, an energy, or "
+                "Squared(objective)"
+            )
         return evaluation.value
 
     def slope(self, model: Model, step: Tensor) -> Tensor:
@@ -127,7 +130,7 @@ class JtjLm(_Root):
 
 
 @dataclass(frozen=True)
-class Lm(_Minimum):
+class Lm(Minimising):
     """Levenberg–Marquardt on a value: −(H + λD)⁻¹r with the exact Hessian H, D the diagonal of its approximation K. It is the
     stiffness' step where H + λD is indefinite and leads uphill."""
 
@@ -143,7 +146,7 @@ class Lm(_Minimum):
 
 
 @dataclass(frozen=True)
-class GaussNewtonLm(_Minimum):
+class GaussNewtonLm(Minimising):
     """JTJ-LM on a value that is a sum of squares: −(K + λD)⁻¹r with K = Σ (∂p/∂θ)ᵀW(∂p/∂θ), the part of the Hessian without the
     curvature of p(θ) (assembled link by link, never as a product of tall matrices)."""
 

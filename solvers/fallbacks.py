@@ -8,6 +8,8 @@ simulator's.
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -15,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.objective import Relaxable, Solution, Status, unsolved_worlds
+from pbfd_torch.solvers.objective import Objective, Relaxable, Solution, Status, unsolved_worlds
 
 
 class Detour(Protocol):
@@ -36,6 +38,16 @@ class Detour(Protocol):
         ...
 
 
+def climbed(solver: Descent, tolerance: float, stages: Sequence[Callable[[Tensor], Objective]], start: Tensor) -> list[Solution]:
+    """Solves each stage, a problem that may depend on where the one before it ended, to the tolerance from there."""
+    rough = dataclasses.replace(solver, tolerance=tolerance)
+    climbs: list[Solution] = []
+    for stage in stages:
+        climbs.append(rough.solve(stage(start), start))
+        start = climbs[-1].q
+    return climbs
+
+
 @dataclass(frozen=True)
 class WarmStart:
     """The minimiser of E with the friction lagged: held at the normal forces of the start, then at those of the minimiser found."""
@@ -47,12 +59,7 @@ class WarmStart:
 
     def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
         """See `Detour`."""
-        rough = dataclasses.replace(solver, tolerance=self.tolerance)
-        climbs: list[Solution] = []
-        for _ in range(self.passes):
-            climbs.append(rough.solve(objective.lagged(start), start))
-            start = climbs[-1].q
-        return climbs
+        return climbed(solver, self.tolerance, [objective.lagged] * self.passes, start)
 
 
 @dataclass(frozen=True)
@@ -67,14 +74,12 @@ class Continuation:
 
     def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
         """See `Detour`."""
-        rough = dataclasses.replace(solver, tolerance=self.tolerance)
-        climbs: list[Solution] = []
-        for width, stiffness in self.ladder:
+
+        def eased(width: float, stiffness: float, _: Tensor) -> Relaxable:
             stage = objective.widened(width) if width > 1 else objective
-            stage = stage.softened(stiffness) if stiffness < 1 else stage
-            climbs.append(rough.solve(stage, start))
-            start = climbs[-1].q
-        return climbs
+            return stage.softened(stiffness) if stiffness < 1 else stage
+
+        return climbed(solver, self.tolerance, [functools.partial(eased, *rung) for rung in self.ladder], start)
 
 
 WIDTHS = Continuation(((1000.0, 1.0), (100.0, 1.0), (10.0, 1.0)))
@@ -98,24 +103,29 @@ class Fallbacks:
     def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
         """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours."""
         solution = self.direct.solve(objective, guess, retreat)
-        return self.rescued(objective, solution, guess if retreat is None else retreat)
+        return self.rescued(objective, solution, guess, guess if retreat is None else retreat)
 
-    def rescued(self, objective: Relaxable, solution: Solution, start: Tensor) -> Solution:
-        """The solution of the direct way with its unsolved worlds led along the detours, from `start` `[*batch, nq]`."""
+    def rescued(self, objective: Relaxable, solution: Solution, guess: Tensor, start: Tensor) -> Solution:
+        """The solution of the direct way with its unsolved worlds led along the detours, from `start`; what these leave tries the
+        direct way from `guess` after all, as the retreat from it may have been the mistake. Both starts are `[*batch, nq]`."""
         for detour in self.detours:
             index = unsolved_worlds(solution)
             if len(index) == 0:
-                break
+                return solution
             part = objective.take(index)
             climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
             climbs.append(self.last.solve(part, climbs[-1].q))
             solution = merged(solution, index, climbs, detour.kind, detour.status)
-        return solution
+        index = unsolved_worlds(solution)
+        if len(index) == 0 or guess is start:
+            return solution
+        again = self.last.solve(objective.take(index), guess.reshape(-1, guess.shape[-1])[index])
+        return merged(solution, index, [again], None, Status.SOLVED)
 
 
-def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int, status: Status) -> Solution:
+def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int | None, status: Status) -> Solution:
     """The solution with the worlds at `index` (of the flattened batch) replaced by the last of `climbs` where that is better, and
-    charged with what all of them cost and with one fallback of this kind."""
+    charged with what all of them cost and with one fallback of this kind (None: of no kind)."""
     batch = before.status.shape
 
     def flat(x: Tensor) -> Tensor:
@@ -136,7 +146,8 @@ def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int, s
         return flat(old).index_copy(0, index, flat(old)[index] + cost).reshape(old.shape)
 
     tried = flat(before.fallbacks)[index]
-    tried[:, kind] += 1
+    if kind is not None:
+        tried[:, kind] += 1
     return Solution(
         q=put(before.q, end.q),
         status=put(before.status, ended.to(before.status.dtype)),

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.solvers.directions import Model
-from pbfd_torch.solvers.objective import Evaluation, Objective, Valued
+from pbfd_torch.solvers.directions import Minimising, Model
+from pbfd_torch.solvers.objective import Evaluation, Objective
+from pbfd_torch.solvers.per_world import chosen
 
 
 @dataclass(frozen=True)
-class Lbfgs:
+class Lbfgs(Minimising):
     """Attributes:
     memory: pairs (step, change of the gradient) that are kept, the newest first.
     first_step: largest entry of the first step [m, rad], before any curvature is known.
@@ -41,8 +42,7 @@ class Lbfgs:
             torch.cat((change[..., None, :], changes[..., :-1, :]), -2),
             torch.cat((newest[..., None], kept[..., :-1]), -1),
         )
-        same = (steps, changes, kept)
-        return r, *(torch.where(_like(usable, new), new, old) for new, old in zip(pushed, same, strict=True))
+        return r, *chosen(usable, pushed, (steps, changes, kept))
 
     def step(self, model: Model, damping: Tensor) -> Tensor:
         """−(H⁻¹)r; without pairs, downhill by `first_step`."""
@@ -65,20 +65,6 @@ class Lbfgs:
             direction = direction + (shares[k] - share)[..., None] * steps[..., k, :]
         return -direction
 
-    def merit(self, objective: Objective, evaluation: Evaluation) -> Tensor:
-        """The value."""
-        if not isinstance(evaluation, Valued):
-            raise TypeError("L-BFGS minimises a value, and the objective has none: use an energy, or Squared(objective)")
-        return evaluation.value
-
-    def slope(self, model: Model, step: Tensor) -> Tensor:
-        """r·d."""
-        return (model[0] * step).sum(-1)
-
     def decrease(self, model: Model, step: Tensor) -> Tensor:
         """Half the slope: what the quadratic model says of its own full step."""
         return -0.5 * self.slope(model, step)
-
-
-def _like(mask: Tensor, value: Tensor) -> Tensor:
-    return mask.reshape((*mask.shape, *(1,) * (value.ndim - mask.ndim)))

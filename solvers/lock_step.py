@@ -6,13 +6,13 @@ numbers: each one sees only itself.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.objective import FALLBACKS, Objective, Solution
+from pbfd_torch.solvers.per_world import mapped
 
 if TYPE_CHECKING:
     from pbfd_torch.solvers.descent import Descent
@@ -58,21 +58,6 @@ def solution(progress: Any, guess: Tensor, lanes: int) -> Solution:
         fallbacks=count.new_zeros((*batch, len(FALLBACKS))),
         lanes=lanes,
     )
-
-
-def mapped(function: Any, first: Any, *others: Any) -> Any:
-    """The same structure of dataclasses and tuples with the function of the tensors at each place."""
-    if isinstance(first, Tensor):
-        return function(first, *others)
-    if isinstance(first, tuple):
-        return tuple(mapped(function, *items) for items in zip(first, *others, strict=True))
-    if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        changes = {
-            f.name: mapped(function, getattr(first, f.name), *(getattr(o, f.name) for o in others))
-            for f in dataclasses.fields(first)
-        }
-        return dataclasses.replace(first, **changes)
-    return first
 
 
 def _scattered(whole: Any, part: Any, index: Tensor) -> Any:

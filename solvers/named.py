@@ -1,6 +1,6 @@
 """The solvers by name: which direction and search make which, on what they minimise.
 
-LM and L-BFGS minimise a value. On GE (Eq. 13) that is ½‖r‖², for which `on_squares` wraps the objective; on E (Eq. 6) it is the
+LM and L-BFGS minimise a value. On GE (Eq. 13) that is ½‖r‖², for which `OnSquares` wraps the objective; on E (Eq. 6) it is the
 objective's own, which must then have one. JTJ-LM serves both.
 """
 
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.directions import GaussNewtonLm, JtjLm, Lm, Newton
+from pbfd_torch.solvers.directions import GaussNewtonLm, JtjLm, Lm
 from pbfd_torch.solvers.lbfgs import Lbfgs
 from pbfd_torch.solvers.objective import Relaxable, Solution
-from pbfd_torch.solvers.searches import Secant, TrustRegion, WorkSearch
+from pbfd_torch.solvers.searches import FullStep, Secant, TrustRegion, WorkSearch
 from pbfd_torch.solvers.squared import Squared
 
 
@@ -42,11 +42,6 @@ class OnLagged:
         return self.solver.solve(objective.lagged(guess if retreat is None else retreat), guess, retreat)
 
 
-def newton() -> Descent:
-    """The default: JTJ-LM's step for λ → 0, searched along by work."""
-    return Descent(Newton(), WorkSearch())
-
-
 def jtj_lm() -> Descent:
     """JTJ-LM as the paper describes it, for roots: Eq. 14 with Marquardt's damping, on ½‖r‖²."""
     return Descent(JtjLm(), TrustRegion())
@@ -63,8 +58,8 @@ def lm() -> Descent:
 
 
 def lbfgs() -> Descent:
-    """L-BFGS for a value, searched along by work without second derivatives."""
-    return Descent(Lbfgs(), WorkSearch(interpolation=Secant()), max_evaluations=4000)
+    """L-BFGS for a value, searched along by work from gradients alone."""
+    return Descent(Lbfgs(), WorkSearch(first=FullStep(), interpolation=Secant()), max_evaluations=4000)
 
 
 TABLE_1: dict[str, Callable[[], Descent | OnSquares | OnLagged]] = {

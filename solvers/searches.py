@@ -49,6 +49,10 @@ class Memory:
     length: Tensor
     damping: Tensor
 
+    def merged(self, where: Tensor, **changes: Tensor) -> Self:
+        """The same memory with some values changed, for the worlds in `where`."""
+        return dataclasses.replace(self, **{k: torch.where(where, v, getattr(self, k)) for k, v in changes.items()})
+
 
 M = TypeVar("M", bound=Memory)
 
@@ -88,9 +92,6 @@ class Bracket(Memory):
     high: Tensor
     high_work: Tensor
     high_curvature: Tensor
-
-    def merged(self, where: Tensor, **changes: Tensor) -> Self:
-        return dataclasses.replace(self, **{k: torch.where(where, v, getattr(self, k)) for k, v in changes.items()})
 
 
 class FirstLength(Protocol):
@@ -172,7 +173,7 @@ class Secant:
 class Touching:
     """A straight line that starts at the low end, plus a parabola that sets in where something touches: what a trial sees that has
     run into a contact whose force grows with the square of the depth. Both ends' slopes fix all of it; the secant where they
-    contradict it. Three evaluations fewer than the secant on a typical landing."""
+    contradict it."""
 
     nearest: float = 0.02
 
@@ -262,12 +263,7 @@ class Backtracking:
     def aim(self, memory: Descended, start: Trial, where: Tensor) -> Descended:
         """See `Search`."""
         slope = start.rule.slope(start.model, start.direction)
-        return Descended(
-            torch.where(where, 1.0, memory.length),
-            memory.damping,
-            torch.where(where, start.merit, memory.merit),
-            torch.where(where, slope, memory.slope),
-        )
+        return memory.merged(where, length=torch.ones_like(slope), merit=start.merit, slope=slope)
 
     def judge(self, memory: Descended, trial: Trial) -> tuple[Verdict, Descended]:
         """See `Search`."""
@@ -307,7 +303,7 @@ class TrustRegion:
     def aim(self, memory: Trust, start: Trial, where: Tensor) -> Trust:
         """See `Search`; the promise is renewed everywhere, since a rejected world's step has changed with its damping."""
         promised = start.rule.decrease(start.model, start.direction)
-        return dataclasses.replace(memory, merit=torch.where(where, start.merit, memory.merit), promised=promised)
+        return dataclasses.replace(memory.merged(where, merit=start.merit), promised=promised)
 
     def judge(self, memory: Trust, trial: Trial) -> tuple[Verdict, Trust]:
         """See `Search`."""

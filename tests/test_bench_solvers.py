@@ -20,6 +20,7 @@ from pbfd_torch.bench.timing import exponent, fit_sizes, timed, worst
 from pbfd_torch.cli import bench_solvers
 from pbfd_torch.cli.main import main
 from pbfd_torch.solvers.named import TABLE_1
+from tests.printed import json_object
 
 TINY = ("--steps", "2", "--seconds", "0.05", "--sizes", "5,10", "--batch", "2", "--repeats", "1")
 FILES = {"solvers.json", "fig4.png", "table1.png"}
@@ -48,14 +49,7 @@ class Ran:
     @property
     def report(self) -> dict[str, Any]:
         """The one JSON object that was printed; NaN and infinity are refused."""
-
-        def refuse(constant: str) -> None:
-            raise ValueError(f"{constant} is not JSON")
-
-        assert self.out.count("\n") == 1
-        found = json.loads(self.out, parse_constant=refuse)
-        assert isinstance(found, dict)
-        return found
+        return json_object(self.out)
 
 
 @pytest.fixture(scope="module")

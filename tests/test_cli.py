@@ -27,6 +27,7 @@ from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from tests.gymnasium_files import gymnasium_file
+from tests.printed import json_object
 
 ROOT = Path(__file__).parent.parent
 ARM = Path(__file__).parent / "data" / "arm_description" / "arm.urdf"
@@ -55,14 +56,7 @@ class Ran:
     @property
     def data(self) -> dict[str, Any]:
         """The one JSON object that was printed; raises for anything else, NaN and infinity included."""
-
-        def refuse(constant: str) -> None:
-            raise ValueError(f"{constant} is not JSON")
-
-        assert self.out.count("\n") == 1
-        found = json.loads(self.out, parse_constant=refuse)
-        assert isinstance(found, dict)
-        return found
+        return json_object(self.out)
 
     @property
     def words(self) -> str:

@@ -12,8 +12,8 @@ from pbfd_torch import Rollout, Simulator
 from pbfd_torch.models import SCENES
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.solvers.descent import Descent, Progress
-from pbfd_torch.solvers.lock_step import mapped
 from pbfd_torch.solvers.named import jtj_lm, lbfgs
+from pbfd_torch.solvers.per_world import mapped
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

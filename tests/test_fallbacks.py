@@ -282,10 +282,27 @@ def test_halves_are_never_shorter_than_the_shortest_step() -> None:
     assert solution.fallbacks.tolist() == [[0, 0, 0]] * 3
 
 
+def test_guess_is_tried_after_all() -> None:
+    """3 tanh q = 0: ‖r‖ = 2.3 at the guess 1 sends the search to the retreat, 20, where J is 1e-17 and the budget runs out. From
+    the guess itself it takes a few evaluations, which are counted as well; no fallback is. Without a retreat nothing is tried twice."""
+    objective = FunctionObjective(lambda q, ease: 3 * torch.tanh(q), torch.ones(1, dtype=torch.float64))
+    guess, retreat = (torch.tensor([x], dtype=torch.float64) for x in (1.0, 20.0))
+    brief = Descent(max_evaluations=8)
+    assert int(brief.solve(objective, guess, retreat).status) == Status.ITERATION_LIMIT
+    solution = Fallbacks(brief, Descent(max_evaluations=20), detours=()).solve(objective, guess, retreat)
+    alone = brief.solve(objective, guess)
+    assert int(solution.status) == Status.SOLVED
+    assert torch.equal(solution.q, alone.q)
+    assert int(solution.evaluations) == 8 + int(alone.evaluations)
+    assert solution.fallbacks.tolist() == [0, 0, 0]
+    once = Descent(max_evaluations=1)
+    assert int(Fallbacks(once, once, detours=()).solve(objective, guess).evaluations) == 1
+
+
 def test_halved_steps_of_a_chain() -> None:
     """An impact at Δt = .05 with 14 evaluations and no detours: halving solves steps that are unsolved without it."""
     setup = chain_slope_drop(worlds=1)
-    hasty = Fallbacks(Descent(max_evaluations=14), detours=())
+    hasty = Fallbacks(Descent(max_evaluations=14), Descent(max_evaluations=14), detours=())
     helped, alone = (Simulator(setup.scene, 0.05, solver=hasty, halvings=n) for n in (3, 0))
     state = helped.initial_state(setup.q, setup.v)
     seen: set[int] = set()

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.asynchronous import AsynchronousRollout
+from pbfd_torch.bench.starts import scattered
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.implicit_euler import State
-from pbfd_torch.kinematics import retract
-from pbfd_torch.models import SCENES, Setup
+from pbfd_torch.models import SCENES
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers import lock_step
@@ -24,16 +24,6 @@ from pbfd_torch.workers import Workers
 from tests.random_trees import generator
 
 ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor" and f.name != "lanes"]
-
-
-def scattered(setup: Setup, bend: float = 0.3, speed: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Random starts: every joint bent, everything moving, the root where it was but turned."""
-    random, a = generator(0), setup.scene.articulation
-
-    def normal() -> Tensor:
-        return torch.randn(setup.worlds, a.nv, dtype=torch.float64, generator=random).to(setup.q.dtype)
-
-    return retract(a, setup.q, bend * normal() * a.topology.turns.to(setup.q.dtype)), setup.v + speed * normal()
 
 
 def assert_equal(a: Rollout, b: Rollout) -> None:
@@ -64,7 +54,7 @@ def test_every_world_has_the_control_of_its_own_step() -> None:
     round by a world's place in memory)."""
     setup = SCENES["hopper"](worlds=12)
     simulator = Simulator(setup.scene, 0.02)
-    state = simulator.initial_state(*scattered(setup, 0.05))
+    state = simulator.initial_state(*scattered(setup, bend=0.05))
     controls = 2 * torch.rand(20, 12, setup.scene.nu, dtype=torch.float64, generator=generator(3)) - 1
     straight = simulator.rollout(state, controls)
     rollout = AsynchronousRollout(simulator, state, 20, controls).finish()
@@ -76,7 +66,7 @@ def test_policy_sees_each_world_at_its_own_step() -> None:
     """A policy of step, q and v, row by row, against the same law applied in lock step."""
     setup = SCENES["hopper"](worlds=6)
     simulator = Simulator(setup.scene, 0.02)
-    state = simulator.initial_state(*scattered(setup, 0.05))
+    state = simulator.initial_state(*scattered(setup, bend=0.05))
 
     def policy(step: Tensor, q: Tensor, v: Tensor) -> Tensor:
         return torch.sin(0.3 * step[:, None] + q[:, -setup.scene.nu :]) - 0.1 * v[:, -setup.scene.nu :]
