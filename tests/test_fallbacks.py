@@ -283,8 +283,10 @@ def test_halves_are_never_shorter_than_the_shortest_step() -> None:
 
 
 def test_guess_is_tried_after_all() -> None:
-    """3 tanh q = 0: ‖r‖ = 2.3 at the guess 1 sends the search to the retreat, 20, where J is 1e-17 and the budget runs out. From
-    the guess itself it takes a few evaluations, which are counted as well; no fallback is. Without a retreat nothing is tried twice."""
+    """3 tanh q = 0: ‖r‖ = 2.3 at the guess 1 sends the search to the retreat, 20, where J is 1e-17 and the budget runs out.
+
+    From the guess itself it takes a few evaluations, which are counted too; no fallback is. Without a retreat nothing is tried
+    twice."""
     objective = FunctionObjective(lambda q, ease: 3 * torch.tanh(q), torch.ones(1, dtype=torch.float64))
     guess, retreat = (torch.tensor([x], dtype=torch.float64) for x in (1.0, 20.0))
     brief = Descent(max_evaluations=8)
