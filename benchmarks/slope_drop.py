@@ -45,8 +45,8 @@ def ours(dt: float, worlds: int, duration: float) -> dict[str, Any]:
 
 def mjcf(dt: float, integrator: str) -> str:
     """The same chain, start and slope for MuJoCo, with stiff contacts and elliptic cones."""
-    pitch = math.radians(20)
-    height = 0.1 + chains.RADIUS + 10 * chains.LENGTH * math.sin(pitch)
+    start = SCENES["chain-slope-drop"]().q[0].tolist()
+    position, turn = (" ".join(map(repr, part)) for part in (start[:3], start[3:7]))
     g, slope = chains.GRAVITY, chains.SLOPE
     across = chains.MASS * (3 * chains.RADIUS**2 + chains.LENGTH**2) / 12
     moments = f"{chains.MASS * chains.RADIUS**2 / 2} {across} {across}"
@@ -56,9 +56,7 @@ def mjcf(dt: float, integrator: str) -> str:
     body = ""
     for k in reversed(range(10)):
         joint = "<freejoint/>" if k == 0 else '<joint type="hinge" axis="0 1 0"/>'
-        place = (
-            f'pos="0 0 {height}" quat="{math.cos(pitch / 2)} 0 {math.sin(pitch / 2)} 0"' if k == 0 else f'pos="{chains.LENGTH} 0 0"'
-        )
+        place = f'pos="{position}" quat="{turn}"' if k == 0 else f'pos="{chains.LENGTH} 0 0"'
         body = f"<body {place}>{joint}{shapes}{body}</body>"
     return f"""<mujoco><option timestep="{dt}" integrator="{integrator}" cone="elliptic" impratio="100"
         gravity="{g * math.sin(slope)} 0 {-g * math.cos(slope)}"/>
