@@ -44,8 +44,9 @@ SUBSTEPS = {
 }
 NOTES = (
     (
-        "an iteration is evaluation, merit, model and step of our implementation, without its search, and takes only the substeps that it needs: "
-        "JTJ-LM's QR factorises [J; √λ D] and needs no JᵀJ; LM and the default solve with exact and convex matrix at once"
+        "an iteration is evaluation, merit, model and step of our implementation, without its search, and takes only the "
+        "substeps that it needs: JTJ-LM's QR factorises [J; √λ D] and needs no JᵀJ; LM and the default solve with exact and convex "
+        "matrix at once"
     ),
     "the paper's exponents are for a GPU with one core per degree of freedom; on a CPU its inversion is O(n³)",
     "exponents are fitted over the larger sizes only; where they are below the paper's, overhead and cheap arithmetic still rule",
