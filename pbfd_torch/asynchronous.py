@@ -42,10 +42,11 @@ class AsynchronousRollout:
 
     def __init__(self, simulator: Simulator, state: State, steps: int, control: Tensor | Policy | None = None) -> None:
         solver = simulator.solver
+        self._fallbacks: Fallbacks | None
         if isinstance(solver, Fallbacks):
             self._direct, self._fallbacks = solver.direct, solver
         elif isinstance(solver, Descent):
-            self._direct, self._fallbacks = solver, Fallbacks(solver, detours=())
+            self._direct, self._fallbacks = solver, None
         else:
             raise InputError(f"the solver is a {type(solver).__name__}: must be a Descent or Fallbacks")
         if state.q.ndim != 2:
@@ -124,8 +125,9 @@ class AsynchronousRollout:
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
         if len(unsolved_worlds(found)):
             simulator = self._simulator.take(lanes)
-            objective = self._objective.take(index)
-            found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
+            if self._fallbacks is not None:
+                objective = self._objective.take(index)
+                found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
             advanced, found = simulator.finished(state, held, found)
             self.lanes += found.lanes
         else:

@@ -31,6 +31,16 @@ def assert_equal(a: Rollout, b: Rollout) -> None:
         assert torch.equal(getattr(a, name), getattr(b, name)), name
 
 
+def test_asynchronous_without_fallbacks() -> None:
+    """A plain descent that gives up after 10 evaluations: what it leaves unsolved stays so, as in lock step."""
+    setup = SCENES["chain-ground"](worlds=8)
+    simulator = Simulator(setup.scene, 0.05, solver=Descent(max_evaluations=10), halvings=0)
+    state = simulator.initial_state(*scattered(setup))
+    straight = simulator.rollout(state, steps=10)
+    assert not bool(straight.solved.all())
+    assert_equal(AsynchronousRollout(simulator, state, 10).finish(), straight)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 def test_asynchronous_trajectories_are_those_of_lock_step(dtype: torch.dtype) -> None:
     """12 falling chains through their landing, with fallbacks among them: bitwise the same record, counts and statuses included;
