@@ -8,21 +8,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pbfd_torch.contact.convex import ConvexSurface
+from pbfd_torch.contact.pairing import Touchable
+from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSurface, SphereSurface
+from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
 
 Points = NDArray[np.float64]
 
 
+@runtime_checkable
 class Shape(Protocol):
     """A shape in its own frame, centred at the origin; lengths in metres."""
 
     def candidates(self) -> tuple[Points, Points]:
         """Centres `[n, 3]` and radii `[n]` of the points that can touch a plane."""
+        ...
+
+
+@runtime_checkable
+class Solid(Protocol):
+    """A shape with an exact signed distance: every one but `Point` and `Ellipsoid`."""
+
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        """The signed distance in the shape's own frame."""
         ...
 
 
@@ -49,6 +64,9 @@ class Sphere:
     def candidates(self) -> tuple[Points, Points]:
         return np.zeros((1, 3)), np.array([self.radius])
 
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        return SphereSurface(torch.tensor([self.radius], dtype=dtype, device=device))
+
 
 @dataclass(frozen=True)
 class Capsule:
@@ -63,6 +81,10 @@ class Capsule:
     def candidates(self) -> tuple[Points, Points]:
         return np.array([[0, 0, -self.half_length], [0, 0, self.half_length]]), np.full(2, self.radius)
 
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        start, end = torch.tensor([[[0, 0, -self.half_length]], [[0, 0, self.half_length]]], dtype=dtype, device=device)
+        return SegmentSurface(start, end, torch.tensor([self.radius], dtype=dtype, device=device))
+
 
 @dataclass(frozen=True)
 class Box:
@@ -74,6 +96,9 @@ class Box:
     def candidates(self) -> tuple[Points, Points]:
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
         return signs * np.array(self.half_extents), np.zeros(8)
+
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        return BoxSurface(torch.tensor([self.half_extents], dtype=dtype, device=device))
 
 
 @dataclass(frozen=True)
@@ -94,6 +119,10 @@ class Cylinder:
         ring = np.stack((self.radius * np.cos(angle), self.radius * np.sin(angle)), -1)
         ends = [np.concatenate((ring, np.full((self.rim_points, 1), z)), 1) for z in (-self.half_length, self.half_length)]
         return np.concatenate(ends), np.zeros(2 * self.rim_points)
+
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        radius, half_length = torch.tensor([[self.radius], [self.half_length]], dtype=dtype, device=device)
+        return CylinderSurface(radius, half_length)
 
 
 @dataclass(frozen=True)
@@ -128,28 +157,23 @@ class ConvexHull:
     def candidates(self) -> tuple[Points, Points]:
         return self.vertices, np.zeros(len(self.vertices))
 
+    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
+        return ConvexSurface.from_vertices(self.vertices, dtype, device)
+
 
 @dataclass(frozen=True)
-class Collider:
-    """A shape on a link. `friction`: Coulomb's μ of its surface; `margin` [m]: skin around the shape in which the force sets
-    in already. Two colliders touch where (`group` of one) & (`mask` of the other) ≠ 0 in either direction; the larger
-    `priority` decides μ, and at equal priority the larger μ does; `frictionless`: there is no friction where this collider
-    decides, or where the other one is frictionless too (MuJoCo's rules)."""
+class Collider(Touchable):
+    """A shape on a link, at a place in the link's frame. `margin` [m]: skin around the shape in which the force of its candidate
+    points sets in already."""
 
     name: str
     link: str
     shape: Shape
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    friction: float = 1.0
     margin: float = 0.0
-    group: int = 1
-    mask: int = 1
-    priority: int = 0
-    frictionless: bool = False
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.friction) and self.friction >= 0):
-            raise InputError(f"friction of collider '{self.name}' is {self.friction}: must be ≥ 0 and finite")
+        self.require_friction(f"collider '{self.name}'")
         if not (math.isfinite(self.margin) and self.margin >= 0):
             raise InputError(f"margin of collider '{self.name}' is {self.margin} m: must be ≥ 0 and finite")
