@@ -1,0 +1,69 @@
+"""Candidates between spheres and boxes, in closed form: the signed distance of a sphere from a box is exact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.primitives import BoxSurface
+from pbfd_torch.contact.surface import Placed
+from pbfd_torch.worlds import Worlds, replaced
+
+
+@dataclass(frozen=True, eq=False)
+class BallBoxPairs:
+    """Spheres beside boxes.
+
+    Attributes:
+        pair, first, second: `[m]` the number of each pair, the sphere's body, the box's.
+        position, radius: `[m, 3]`, `[m]` the sphere's centre in its body's frame, and its radius [m].
+        frame, half_extents: `[m, 3, 4]`, `[m, 3]` of the box in its body [m].
+        slots: how many candidates a world keeps.
+    """
+
+    pair: Tensor
+    first: Tensor
+    second: Tensor
+    position: Tensor
+    radius: Tensor
+    frame: Tensor
+    half_extents: Tensor
+    slots: int
+
+    def _box(self, index: Tensor) -> Placed:
+        # no new checks: the sizes were checked when the shapes were made
+        return Placed(replaced(_TEMPLATE, half_extents=self.half_extents[index]), self.frame[index])
+
+    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+        """See `Finder`."""
+        first, second = bodies[..., self.first, :3, :], bodies[..., self.second, :3, :]
+        centers = (first[..., :3] @ self.position[..., None]).squeeze(-1) + first[..., 3]
+        seen = (second[..., :3].mT @ (centers - second[..., 3])[..., None]).squeeze(-1)
+        gap = self._box(torch.arange(len(self.pair), device=self.pair.device)).field(seen).distance - self.radius
+        near = gap < reach[..., self.first] + reach[..., self.second]
+        which, filled, dropped = nearest(gap, near, self.slots)
+        return Slots(
+            filled=filled,
+            pair=self.pair[which],
+            first=self.first[which],
+            position=self.position[which],
+            radius=self.radius[which],
+            second=self.second[which],
+            surface=self._box(which),
+            dropped=dropped,
+        )
+
+    def take(self, worlds: Worlds) -> Self:
+        """Itself: all worlds have the same colliders."""
+        return self
+
+    def grown(self) -> Self:
+        """See `Finder`."""
+        return replaced(self, slots=2 * self.slots)
+
+
+_TEMPLATE = BoxSurface(torch.ones(1, 3))

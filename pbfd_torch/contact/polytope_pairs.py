@@ -1,0 +1,191 @@
+"""Candidates between convex bodies with flat faces: points of one against a plane of the other, by `manifold`.
+
+The broad phase picks the pairs that may come near each other in the step; of these the direction of separation comes from closed
+forms for boxes and from FCL for all others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.contact.broad_phase import AllPairs, BroadPhase, FclTree
+from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.manifold import Manifold, manifold
+from pbfd_torch.contact.polytope import Polytope, PolytopeTable
+from pbfd_torch.contact.separation import box_separation, fcl_geometries, fcl_separation, rotated
+from pbfd_torch.contact.surface import Plane
+from pbfd_torch.worlds import Worlds, replaced
+
+POINTS = 8  # of one pair at most
+MANY = 30_000  # pairs from which on FCL's tree is faster than looking at all of them
+
+
+@dataclass(frozen=True, eq=False)
+class PolytopePairs:
+    """Attributes:
+    pair: `[m]` the number of each pair.
+    first, second: `[m]` their colliders.
+    body, frame: `[c]`, `[c, 4, 4]` the body of each collider, and where its shape is in it.
+    table, geometries: the shapes `[c]` as tensors, and as FCL's, which all worlds share; these may be empty where all are boxes.
+    boxes: `[m]` bool, pairs of two boxes.
+    broad_phase: what picks the pairs that are looked at.
+    slots: how many candidates a world keeps.
+    """
+
+    pair: Tensor
+    first: Tensor
+    second: Tensor
+    body: Tensor
+    frame: Tensor
+    table: PolytopeTable
+    geometries: Sequence[Any]
+    boxes: Tensor
+    broad_phase: BroadPhase
+    slots: int
+
+    @staticmethod
+    def of(
+        pairs: Sequence[tuple[int, int, int]],
+        bodies: Sequence[int],
+        frames: Tensor,
+        polytopes: Sequence[Polytope],
+        are_boxes: Sequence[bool],
+        slots: int,
+    ) -> PolytopePairs:
+        """From pairs (number, collider, collider); of each collider its body, its frame in it `[c, 4, 4]`, its shape, and whether
+        that is a box."""
+        device = frames.device
+
+        def index(values: Sequence[int]) -> Tensor:
+            return torch.tensor(values, dtype=torch.long, device=device)
+
+        first, second = index([a for _, a, _ in pairs]), index([b for _, _, b in pairs])
+        boxes = [are_boxes[a] and are_boxes[b] for _, a, b in pairs]
+        return PolytopePairs(
+            pair=index([k for k, _, _ in pairs]),
+            first=first,
+            second=second,
+            body=index(bodies),
+            frame=frames,
+            table=PolytopeTable.stack(polytopes).to(frames.dtype, device),
+            geometries=[] if all(boxes) else fcl_geometries(polytopes),
+            boxes=torch.tensor(boxes, device=device),
+            broad_phase=FclTree(first, second) if len(pairs) > MANY else AllPairs(first, second),
+            slots=slots,
+        )
+
+    @cached_property
+    def _all_boxes(self) -> bool:
+        return bool(self.boxes.all())
+
+    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+        """See `Finder`."""
+        batch = bodies.shape[:-3]
+        poses = bodies[..., self.body, :, :] @ self.frame
+        vertices = poses[..., None, :3, :3] @ self.table.vertices[..., None]
+        vertices = vertices.squeeze(-1) + poses[..., None, :3, 3]
+        room = (self.table.radius + reach[..., self.body])[..., None]
+        near = self.broad_phase.near(vertices.amin(-2) - room, vertices.amax(-2) + room)
+        world, row = near.reshape(-1, len(self.pair)).nonzero().unbind(-1)
+        poses, reach = poses.flatten(0, -4) if batch else poses[None], reach.reshape(-1, reach.shape[-1])
+        found, gap = self._manifolds(poses, world, row)
+        a, b = self.first[row], self.second[row]
+        points = torch.where(found.swapped, b, a)
+        plane = torch.where(found.swapped, a, b)
+        within = found.mask & (gap < (reach[world, self.body[a]] + reach[world, self.body[b]])[:, None])
+        return self._slots(batch, world, row, found, points, plane, gap, within)
+
+    def _manifolds(self, poses: Tensor, world: Tensor, row: Tensor) -> tuple[Manifold, Tensor]:
+        """Contact points of pairs `row` `[k]` in worlds `[k]`, and the gap of each `[k, POINTS]`."""
+        a, b = self.first[row], self.second[row]
+        pose_a, pose_b = poses[world, a], poses[world, b]
+        boxes = self.boxes[row]
+        if self._all_boxes:
+            normal = box_separation(self.table, a, b, pose_a, pose_b).normal
+        else:
+            normal = torch.empty_like(pose_a[:, :3, 3])
+            for which, separation in ((boxes, box_separation), (~boxes, self._by_fcl)):
+                some = which.nonzero().squeeze(-1)
+                if len(some):
+                    normal[some] = separation(self.table, a[some], b[some], pose_a[some], pose_b[some]).normal
+        found = manifold(self.table, a, b, pose_a, pose_b, normal, POINTS)
+        swapped = found.swapped[:, None, None]
+        points, plane = torch.where(swapped, pose_b, pose_a), torch.where(swapped, pose_a, pose_b)
+        place = rotated(points[:, None, :3, :3], found.point) + points[:, None, :3, 3]
+        seen = rotated(plane[:, None, :3, :3].mT, place - plane[:, None, :3, 3])
+        gap = (seen * found.normal[:, None]).sum(-1) - found.offset[:, None] - found.radius[:, None]
+        return found, gap
+
+    def _by_fcl(self, table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor) -> Any:
+        return fcl_separation(table, self.geometries, a, b, pose_a, pose_b)
+
+    def _slots(
+        self,
+        batch: tuple[int, ...],
+        world: Tensor,
+        row: Tensor,
+        found: Manifold,
+        points: Tensor,
+        plane: Tensor,
+        gap: Tensor,
+        within: Tensor,
+    ) -> Slots:
+        """The contact points of rows in their worlds' slots."""
+        worlds = math.prod(batch)
+        if len(row) == 0:
+            return self._empty(batch)
+        # rows of one world stand together: their places among them lead to a padded table [worlds, most, POINTS]
+        count = (world == torch.arange(worlds, device=row.device)[:, None]).sum(-1)
+        most = int(count.max())
+        order = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[world]
+        index = torch.zeros((worlds, most), dtype=torch.long, device=row.device)
+        index[world, order] = torch.arange(len(row), device=row.device)
+        there = torch.arange(most, device=row.device) < count[:, None]
+        picked = index.reshape(-1)
+        gaps = gap[picked].reshape(worlds, -1)
+        real = (within[picked].reshape(worlds, most, POINTS) & there[..., None]).reshape(worlds, -1)
+        which, filled, dropped = nearest(gaps, real, self.slots)
+        rows = index.gather(-1, which // POINTS)
+        spot = which % POINTS
+
+        def shaped(values: Tensor) -> Tensor:
+            return values.reshape((*batch, *values.shape[1:]))
+
+        frame_of_points, frame_of_plane = self.frame[points[rows]], self.frame[plane[rows]]
+        position = rotated(frame_of_points[..., :3, :3], found.point[rows, spot]) + frame_of_points[..., :3, 3]
+        normal = rotated(frame_of_plane[..., :3, :3], found.normal[rows])
+        offset = found.offset[rows] + (normal * frame_of_plane[..., :3, 3]).sum(-1)
+        return Slots(
+            filled=shaped(filled),
+            pair=shaped(self.pair[row[rows]]),
+            first=shaped(self.body[points[rows]]),
+            position=shaped(position),
+            radius=shaped(found.radius[rows]),
+            second=shaped(self.body[plane[rows]]),
+            surface=Plane(shaped(normal), shaped(offset)),
+            dropped=shaped(dropped),
+        )
+
+    def _empty(self, batch: tuple[int, ...]) -> Slots:
+        zero = self.frame.new_zeros((*batch, self.slots))
+        none = zero > 0
+        number = torch.zeros_like(none, dtype=torch.long)
+        up = torch.nn.functional.pad(torch.ones_like(zero)[..., None], (2, 0))
+        position = zero[..., None].expand(*zero.shape, 3)
+        first, second = number + self.body[self.first[0]], number + self.body[self.second[0]]
+        return Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])
+
+    def take(self, worlds: Worlds) -> Self:
+        """Itself: all worlds have the same colliders."""
+        return self
+
+    def grown(self) -> Self:
+        """See `Finder`."""
+        return replaced(self, slots=2 * self.slots)

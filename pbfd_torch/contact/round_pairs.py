@@ -1,0 +1,128 @@
+"""Candidates between round bodies: spheres and capsules, in closed form.
+
+Of each pair the first body gives spheres on its axis and the second one is a capsule: the signed distance of a sphere from a
+capsule is exact. Two capsules touch at the nearest points of their axes, and nearly parallel ones along all that lies side by
+side: three spheres, at the nearest point and at both ends of the overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.primitives import SegmentSurface, dot
+from pbfd_torch.worlds import Worlds, replaced
+
+
+@dataclass(frozen=True)
+class Round:
+    """A sphere or a capsule on a body: all points within `radius` [m] of the segment from `start` to `end` in the body's frame."""
+
+    body: int
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+    @property
+    def long(self) -> bool:
+        """A capsule."""
+        return self.start != self.end
+
+
+@dataclass(frozen=True, eq=False)
+class RoundPairs:
+    """Pairs of round colliders. `pair` `[m]`: the number of each pair; `first`, `second`: `[m]` bodies; `axes`: `[m, 4, 3]` the
+    ends of the first one's axis, then of the second one's; `radii`: `[m, 2]`; `slots`: how many candidates a world keeps."""
+
+    pair: Tensor
+    first: Tensor
+    second: Tensor
+    axes: Tensor
+    radii: Tensor
+    slots: int
+
+    @staticmethod
+    def of(pairs: Sequence[tuple[int, Round, Round]], slots: int, like: Tensor) -> RoundPairs:
+        """From pairs (number, one, other) of round colliders; `like`: dtype and device."""
+        # spheres give points, capsules are solids
+        ordered = [(k, b, a) if a.long and not b.long else (k, a, b) for k, a, b in pairs]
+
+        def index(values: list[int]) -> Tensor:
+            return torch.tensor(values, dtype=torch.long, device=like.device)
+
+        return RoundPairs(
+            index([k for k, _, _ in ordered]),
+            index([a.body for _, a, _ in ordered]),
+            index([b.body for _, _, b in ordered]),
+            like.new_tensor([[a.start, a.end, b.start, b.end] for _, a, b in ordered]),
+            like.new_tensor([[a.radius, b.radius] for _, a, b in ordered]),
+            slots,
+        )
+
+    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+        """See `Finder`."""
+        poses = torch.stack((bodies[..., self.first, :, :], bodies[..., self.second, :, :]), -3).repeat_interleave(2, -3)
+        ends = (poses[..., :3, :3] @ self.axes[..., None]).squeeze(-1) + poses[..., :3, 3]  # [*, m, 4, 3]
+        a, b, c, d = ends.unbind(-2)
+        along = _places(a, b, c, d)  # [*, m, 3]
+        centers = a[..., None, :] + along[..., None] * (b - a)[..., None, :]
+        gap = _distance(centers, c[..., None, :], d[..., None, :]) - self.radii.sum(-1)[:, None]
+        near = gap < (reach[..., self.first] + reach[..., self.second])[..., None]
+        long = (self.axes[:, 0] != self.axes[:, 1]).any(-1)[:, None]
+        near = near & (long | (torch.arange(3, device=near.device) == 0))
+        order, filled, dropped = nearest(gap.flatten(-2), near.flatten(-2), self.slots)
+        which = order // 3
+        share = along.flatten(-2).gather(-1, order)[..., None]
+        axis = self.axes[which]
+        surface = replaced(_TEMPLATE, start=axis[..., 2, :], end=axis[..., 3, :], radius=self.radii[which][..., 1])
+        return Slots(
+            filled=filled,
+            pair=self.pair[which],
+            first=self.first[which],
+            position=axis[..., 0, :] + share * (axis[..., 1, :] - axis[..., 0, :]),
+            radius=self.radii[which][..., 0],
+            second=self.second[which],
+            surface=surface,
+            dropped=dropped,
+        )
+
+    def take(self, worlds: Worlds) -> Self:
+        """Itself: all worlds have the same colliders."""
+        return self
+
+    def grown(self) -> Self:
+        """See `Finder`."""
+        return replaced(self, slots=2 * self.slots)
+
+
+# its numbers are replaced at once: parameters were checked when the shapes were made
+_TEMPLATE = SegmentSurface(torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1))
+
+
+def _share(numerator: Tensor, square: Tensor) -> Tensor:
+    """numerator/square in [0, 1], 0 where the square is."""
+    return (numerator / torch.where(square > 0, square, torch.ones_like(square))).clamp(0, 1)
+
+
+def _places(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Where on the segment ab, as shares of it `[*, 3]`: the point nearest to the segment cd, and the two ends of what lies beside
+    cd."""
+    u, v, w = b - a, d - c, a - c
+    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
+    s = _share(uv * vw - vv * uw, uu * vv - uv * uv)
+    t = _share(vw + s * uv, vv)
+    s = _share(t * uv - uw, uu)
+    beside = [_share(dot(point - a, u), uu) for point in (c, d)]
+    return torch.stack((s, *beside), -1)
+
+
+def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Distances of points from segments, `[*]`."""
+    along = end - start
+    share = _share(dot(points - start, along), dot(along, along))
+    return torch.linalg.vector_norm(points - start - share[..., None] * along, dim=-1)
