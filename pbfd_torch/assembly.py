@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.kinematics import Placement, link_jacobians
 from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.load import JointLoad, LinkLoad, Load
 
@@ -64,9 +64,17 @@ class Balance:
         upper = (t.above | t.same_joint).to(axes.dtype)
         lower = t.above.T.to(axes.dtype)
         convex = upper * (axes @ below.mT) + lower * (above @ axes.mT)
-        for load in self._on_joints:
-            convex = convex + load.stiffness
+        for load in self._on_links:
+            if load.coupled:
+                convex = convex + self._coupled(load.coupling)
+        for joint_load in self._on_joints:
+            convex = convex + joint_load.stiffness
         return convex
+
+    def _coupled(self, coupling: Tensor) -> Tensor:
+        """S_aᵀ K_ab S_b summed over pairs of links, S the links' twists by the degrees of freedom."""
+        twists = link_jacobians(self.placement).flatten(-3, -2)
+        return twists.mT @ coupling.transpose(-3, -2).flatten(-4, -3).flatten(-2) @ twists
 
     @cached_property
     def jacobian(self) -> Tensor:

@@ -123,15 +123,17 @@ class AsynchronousRollout:
         part = mapped(lambda x: x[index], self._progress)
         found = solution(part, part.q, 0)
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
+        aftermath = mapped(lambda x: x[index], self._objective.aftermath(self._progress.q))
         if len(unsolved_worlds(found)):
             simulator = self._simulator.take(lanes)
             if self._fallbacks is not None:
                 objective = self._objective.take(index)
                 found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
-            advanced, found = simulator.finished(state, held, found)
+                aftermath = objective.aftermath(found.q)
+            advanced, found = simulator.finished(state, held, found, aftermath)
             self.lanes += found.lanes
         else:
-            advanced = self._simulator.integrator.advance(state, found.q)
+            advanced = self._simulator.integrator.advance(state, found.q, self._simulator.step_size, aftermath)
         self._record(index, advanced, held, found)
         self._state = mapped(lambda old, new: old.index_copy(0, index, new), self._state, advanced)
         self._step = self._step + ended

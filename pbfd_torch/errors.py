@@ -19,5 +19,12 @@ class ModelError(PbfdError, ValueError):
         super().__init__(": ".join(part for part in (file, element, reason) if part))
 
 
+class ContactOverflowError(PbfdError, RuntimeError):
+    """More contacts were near than there are slots for, and the scene asks to stop then. `rollout`: what was computed before, or
+    None."""
+
+    rollout: object = None
+
+
 class NotModelledWarning(UserWarning):
     """Something that a file asks for and that the simulation leaves out; given once per file and feature."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pbfd_torch.assembly import Balance
 from pbfd_torch.kinematics import Motion, Placement, retract
-from pbfd_torch.terms.load import Foretelling, LinkLoad, Term
+from pbfd_torch.terms.load import Foretelling, ForetellingLoad, LinkLoad, Term
 
 
 class Outlook:
@@ -28,7 +28,9 @@ class Outlook:
         self._foretold: list[Callable[[Tensor], Tensor]] = []
         self._on_joints: list[tuple[Term, Any]] = []
         for term, fixed, load in zip(terms, prepared, balance.loads, strict=True):
-            if isinstance(term, Foretelling):
+            if isinstance(load, ForetellingLoad):
+                self._foretold.append(load.outlook(self._motion))
+            elif isinstance(term, Foretelling):
                 self._foretold.append(term.outlook(fixed, self._motion))
             elif isinstance(load, LinkLoad):
                 self._add_linear(load)
@@ -38,6 +40,8 @@ class Outlook:
     def _add_linear(self, load: LinkLoad) -> None:
         """⟨M, [V]⟩ and its change V·A V + ⟨M, [V̇] + [V]²⟩, M the moment and A the stiffness."""
         answer = (load.stiffness * self._motion.twists[..., None, :]).sum(-1)
+        if load.coupled:
+            answer = answer + (load.coupling * self._motion.twists[..., None, :, None, :]).sum((-3, -1))
         change = (load.moment * self._motion.changes).sum((-3, -2, -1))
         self._constant = self._constant + (load.moment * self._motion.velocities).sum((-3, -2, -1))
         self._slope = self._slope + (answer * self._motion.twists).sum((-2, -1)) + change

@@ -13,6 +13,7 @@ from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Recorder:
             "link_poses": placement.poses[..., :3, :],
             "center_of_mass": center_of_mass(placement),
             "kinetic_energy": kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
-            "potential_energy": scene.potential_energy(placement),
+            "potential_energy": scene.potential_energy(placement, state.time),
             "linear_momentum": linear,
             "angular_momentum": angular,
         }
@@ -60,9 +61,10 @@ class Recorder:
             "evaluations": solution.evaluations,
             "residual_norm": solution.residual_norm,
             "fallbacks": solution.fallbacks,
+            "hazards": state.hazards,
         }
         pairs = zip(objective.terms, objective.prepared, strict=True)
-        contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact)]
+        contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]
         points = [term.points(prepared, placement) for term, prepared in contacts]
         if points:
             entries["contact_point"] = torch.cat([x.point for x in points], -2)
@@ -74,7 +76,7 @@ class Recorder:
 
     def finish(self, lanes: int | None = None) -> Rollout:
         """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
-        stacked = {name: torch.stack(values) for name, values in self._entries.items()}
+        stacked = {name: torch.stack(_alike(values)) for name, values in self._entries.items()}
         like = stacked["q"]
         if "contact_depth" not in stacked:
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
@@ -89,3 +91,16 @@ class Recorder:
             time=self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device),
             **stacked,
         )
+
+
+def _alike(values: list[Tensor]) -> list[Tensor]:
+    """The same values, those of contacts with as many slots as the step with the most of them: the number may grow."""
+    most = [max(sizes) for sizes in zip(*(x.shape for x in values), strict=True)]
+    return [_padded(x, most) for x in values]
+
+
+def _padded(value: Tensor, shape: list[int]) -> Tensor:
+    missing = [(0, full - size) for size, full in zip(value.shape, shape, strict=True)]
+    if not any(after for _, after in missing):
+        return value
+    return torch.nn.functional.pad(value, [x for pair in reversed(missing) for x in pair])

@@ -19,7 +19,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.solvers.objective import is_solved
 
-FORMAT = "pbfd_torch rollout 2"
+FORMAT = "pbfd_torch rollout 3"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,7 @@ class Rollout:
         linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
         fallbacks: `[T, *batch, 3]` int, how often each of `FALLBACKS` was tried.
+        hazards: `[T, *batch]` int, `Hazard` bits: what may be wrong with a step although it was solved.
         lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
             `[T, *batch, npoint, 3]` on the body.
@@ -62,6 +63,7 @@ class Rollout:
     evaluations: Tensor
     residual_norm: Tensor
     fallbacks: Tensor
+    hazards: Tensor
     lanes: Tensor
     contact_point: Tensor
     contact_depth: Tensor

@@ -13,12 +13,13 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation, force_scale
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
-from pbfd_torch.errors import InputError, ModelError
+from pbfd_torch.errors import ContactOverflowError, InputError, ModelError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
 from pbfd_torch.kinematics import Motion, Placement, place
-from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
@@ -26,7 +27,7 @@ from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status,
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
-from pbfd_torch.terms.load import Conservative, Term
+from pbfd_torch.terms.load import Aftermath, Conservative, Term
 from pbfd_torch.worlds import Worlds, replaced
 
 SHORTEST_STEP = 1e-5  # [s]
@@ -56,7 +57,7 @@ class Scene:
     terms: Sequence[Term]
     gravity: Tensor
     colliders: Sequence[Collider] = ()
-    obstacles: Sequence[HalfSpace] = ()
+    obstacles: Sequence[HalfSpace | Obstacle] = ()
     name: str = "scene"
 
     def __post_init__(self) -> None:
@@ -75,22 +76,22 @@ class Scene:
                     element=f"joint '{a.joint_names[joint]}'",
                 )
 
-    def potential_energy(self, placement: Placement) -> Tensor:
-        """Stored energy [J] `[*batch]`: gravity, springs, limits and the contacts' normal forces."""
+    def potential_energy(self, placement: Placement, time: Tensor) -> Tensor:
+        """Stored energy [J] `[*batch]` at a time [s]: gravity, springs, limits and the contacts' normal forces."""
         total = potential_energy(placement, self.gravity)
         for term in self.terms:
             if isinstance(term, Conservative):
-                total = total + term.potential(placement)
+                total = total + term.potential(placement, time)
         return total
 
     def energy(self, q: Tensor, v: Tensor) -> Tensor:
-        """Kinetic plus stored energy [J] `[*batch]` at q `[*batch, nq]` and velocity v `[*batch, nv]`."""
+        """Kinetic plus stored energy [J] `[*batch]` at time 0, at q `[*batch, nq]` and velocity v `[*batch, nv]`."""
         placement = place(self.articulation, q)
         rates = Motion(placement, v).rates
         return (
             kinetic_energy(self.articulation, rates)
             + rotor_energy(self.articulation, v, self.terms)
-            + self.potential_energy(placement)
+            + self.potential_energy(placement, torch.zeros_like(q[..., 0]))
         )
 
     @property
@@ -149,7 +150,8 @@ class Simulator:
         trial, solution = self.step(still, control)
         gained = self.integrator.velocity(a, trial, self.step_size) - v
         acceleration = torch.where(solution.solved[..., None], gained / self.step_size, 0.0)
-        return self.integrator.start(a, q, v, acceleration, self.step_size)
+        start = self.integrator.start(a, q, v, acceleration, self.step_size)
+        return replaced(start, memory=blank_memory(self.scene.terms, tuple(batch)))
 
     def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
         a = self.scene.articulation
@@ -165,7 +167,7 @@ class Simulator:
         """The balance of forces that the step from `state` solves."""
         articulation = self.scene.articulation
         context = self.integrator.context(articulation, state, self.step_size, self.scene.gravity, control)
-        return BalanceObjective.of_step(articulation, self.scene.terms, context, self._scale)
+        return BalanceObjective.of_step(articulation, self.scene.terms, context, self._scale, state.memory)
 
     def step(self, state: State, control: Tensor | None = None) -> tuple[State, Solution]:
         """One step of all worlds under `control` `[*batch, nu]` (None: zero). Never raises for one bad world: see the solution's
@@ -177,11 +179,12 @@ class Simulator:
         with torch.no_grad():
             objective = self.objective(state, control)
             solution = self.solver.solve(objective, objective.guess, state.q)
-            return *self.finished(state, control, solution), objective
+            return *self.finished(state, control, solution, objective.aftermath(solution.q)), objective
 
-    def finished(self, state: State, control: Tensor | None, solution: Solution) -> tuple[State, Solution]:
-        """The state after a step that the solver has left at `solution`: unsolved worlds try shorter steps first."""
-        advanced = self.integrator.advance(state, solution.q)
+    def finished(self, state: State, control: Tensor | None, solution: Solution, aftermath: Aftermath) -> tuple[State, Solution]:
+        """The state after a step that the solver has left at `solution`, with this aftermath: unsolved worlds try shorter steps
+        first."""
+        advanced = self.integrator.advance(state, solution.q, self.step_size, aftermath)
         for halvings in range(1, self.halvings + 1):
             index = unsolved_worlds(solution)
             if len(index) == 0 or self.dt / 2**halvings < SHORTEST_STEP:
@@ -203,9 +206,12 @@ class Simulator:
         now = self.integrator.resized(short.scene.articulation, state.take(worlds), self.step_size, short.step_size)
         held = None if control is None else worlds.pick(control, 1)
         climbs: list[Solution] = []
+        hazards = torch.zeros_like(now.hazards)
         for _ in range(parts):
             now, climb = short.step(now, held)
+            hazards = hazards | now.hazards
             climbs.append(climb)
+        now = replaced(now, hazards=hazards)
         end = self.integrator.resized(short.scene.articulation, now, short.step_size, self.step_size)
         solved = torch.stack([x.solved for x in climbs]).all(0)
         worst = torch.stack([x.residual_norm for x in climbs]).amax(0)
@@ -215,9 +221,10 @@ class Simulator:
         result = merged(solution, index, climbs, FALLBACKS.index("halving"), Status.HALVED)
 
         def put(old: Tensor, new: Tensor) -> Tensor:
-            rows = old.reshape(-1, old.shape[-1])
-            chosen = torch.where(solved.reshape(-1, 1), new.reshape(-1, old.shape[-1]), rows[index])
-            return rows.index_copy(0, index, chosen).reshape(old.shape)
+            rows = old.reshape(math.prod(worlds.batch), *old.shape[len(worlds.batch) :])
+            before = rows[index]
+            kept = torch.where(solved.reshape(-1, *(1,) * (rows.ndim - 1)), new.reshape(before.shape), before)
+            return rows.index_copy(0, index, kept).reshape(old.shape)
 
         return mapped(put, advanced, end), result
 
@@ -231,7 +238,8 @@ class Simulator:
         """Steps from `state` and records everything.
 
         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
-        with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
+        with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed.
+        Raises `ContactOverflowError`, which holds the steps done, where the scene asks for it."""
         count = self._count(controls, steps)
         recorder = Recorder(self.scene, self.integrator, self.dt, state)
         try:
@@ -243,6 +251,9 @@ class Simulator:
         except KeyboardInterrupt:
             if recorder.steps == 0:
                 raise
+        except ContactOverflowError as error:
+            error.rollout = recorder.finish() if recorder.steps else None
+            raise
         return recorder.finish()
 
     def _count(self, controls: Tensor | None, steps: int | None) -> int:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.solvers.directions import Direction, Model, Newton
 from pbfd_torch.solvers.lock_step import lock_step
-from pbfd_torch.solvers.objective import Objective, Solution, Status
+from pbfd_torch.solvers.objective import Evaluation, Objective, Solution, Status
 from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.solvers.searches import Memory, Search, Trial, WorkSearch
 
@@ -41,6 +41,20 @@ class Progress:
     running: Tensor
     iterations: Tensor
     evaluations: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What the worlds have found at their trials, before they decide how to go on.
+
+    progress: with those ended that have arrived or are lost. error: ‖r/…‖ at the trials. retreating: who leaves its guess for the
+    retreat; usable: whose trial may be gone on from."""
+
+    progress: Progress
+    evaluation: Evaluation
+    error: Tensor
+    retreating: Tensor
+    usable: Tensor
 
 
 @dataclass(frozen=True)
@@ -93,6 +107,10 @@ class Descent:
 
     def advance(self, objective: Objective, progress: Progress) -> Progress:
         """One round: one evaluation for every world, and each world's own decision. Nothing leaves the device."""
+        return self.proceed(objective, self.sight(objective, progress))
+
+    def sight(self, objective: Objective, progress: Progress) -> Sighting:
+        """The first half of a round: the evaluation, and who ends with it."""
         p = progress
         evaluation = objective.evaluate(p.trial)
         error = objective.error(evaluation, self.tolerance_for(p.q.dtype))
@@ -100,12 +118,27 @@ class Descent:
         searching = p.stage == _SEARCHING
         retreating = p.running & (p.stage == _AT_GUESS) & ~(finite & (error <= self.retreat_above))
         lost = p.running & (p.stage == _AT_RETREAT) & ~finite
+        usable = p.running & finite & ~retreating
+        arrived = usable & (error <= self.tolerance_for(p.q.dtype))
+        status = torch.where(arrived, int(Status.SOLVED), p.status)
+        ended = dataclasses.replace(
+            p,
+            q=chosen(arrived, p.trial, p.q),
+            error=torch.where(arrived | lost | retreating, error, p.error),
+            status=torch.where(lost, int(Status.NON_FINITE), status).to(torch.int32),
+            running=p.running & ~arrived & ~lost,
+            iterations=p.iterations + (arrived & searching).to(torch.int32),
+            evaluations=p.evaluations + p.running.to(torch.int32),
+        )
+        return Sighting(ended, evaluation, error, retreating, usable & ~arrived)
 
+    def proceed(self, objective: Objective, sighting: Sighting) -> Progress:
+        """The second half: every world that runs sets out in a new direction, or changes the length or the damping of its step."""
+        p, evaluation = sighting.progress, sighting.evaluation
+        searching = p.stage == _SEARCHING
         old = p.model if p.model is not None else self.direction.model(objective, evaluation, None, p.direction, ~searching)
         verdict, memory = self.search.judge(p.memory, Trial(objective, self.direction, evaluation, old, p.direction))
-        tolerable = error <= self.tolerance_for(p.q.dtype)
-        accept = p.running & finite & ~retreating & (~searching | verdict.good | tolerable)
-        arrived = accept & tolerable
+        accept = sighting.usable & (~searching | verdict.good)
         stalled = p.running & searching & ~accept & verdict.stalled
         memory = chosen(searching, memory, p.memory)
 
@@ -113,29 +146,25 @@ class Descent:
         model = chosen(accept, new, old)
         # linear solvers leave columns in memory, and sums over those round differently for one world and for many
         direction = self.direction.step(model, memory.damping).contiguous()
-        steps = p.iterations + (accept & searching).to(torch.int32)
         direction = direction * (self.max_turn / objective.turn(direction).clamp_min(self.max_turn))[..., None]
         memory = self.search.aim(memory, Trial(objective, self.direction, evaluation, model, direction), accept)
 
         q = chosen(accept, p.trial, p.q)
         trial = objective.retract(q, memory.length[..., None] * direction)
-        status = torch.where(arrived, int(Status.SOLVED), p.status)
-        status = torch.where(stalled, int(Status.STALLED), status)
-        stage = torch.where(accept, _SEARCHING, torch.where(retreating, _AT_RETREAT, p.stage))
-        evaluations = p.evaluations + p.running.to(torch.int32)
+        stage = torch.where(accept, _SEARCHING, torch.where(sighting.retreating, _AT_RETREAT, p.stage))
         return Progress(
             q=q,
-            trial=chosen(retreating, p.retreat, trial),
+            trial=chosen(sighting.retreating, p.retreat, trial),
             retreat=p.retreat,
             stage=stage.to(torch.int32),
             direction=direction,
             model=model,
             memory=memory,
-            error=torch.where(accept | lost | retreating, error, p.error),
-            status=torch.where(lost, int(Status.NON_FINITE), status).to(torch.int32),
-            running=p.running & ~arrived & ~stalled & ~lost & (evaluations < self.max_evaluations),
-            iterations=steps,
-            evaluations=evaluations,
+            error=torch.where(accept, sighting.error, p.error),
+            status=torch.where(stalled, int(Status.STALLED), p.status).to(torch.int32),
+            running=p.running & ~stalled & (p.evaluations < self.max_evaluations),
+            iterations=p.iterations + (accept & searching).to(torch.int32),
+            evaluations=p.evaluations,
         )
 
 

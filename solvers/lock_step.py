@@ -21,7 +21,8 @@ FEWEST_LANES = 8  # below this a round costs the same however few worlds it serv
 
 
 def lock_step(solver: Descent, objective: Objective, guess: Tensor, retreat: Tensor | None) -> Solution:
-    """Runs the solver's rounds until no world runs any more. Between rounds the host asks how many still do."""
+    """Runs the solver's rounds until no world runs any more. Between rounds the host asks how many still do, and within them
+    whether any is to go on: the last round ends with its evaluation."""
     batch = guess.shape[:-1]
     progress = solver.begin(objective, guess, retreat)
     done = None  # the whole batch, flat, where `progress` holds only the worlds of `lanes`
@@ -38,8 +39,11 @@ def lock_step(solver: Descent, objective: Objective, guess: Tensor, retreat: Ten
             inside = progress.running.nonzero().squeeze(-1)
             objective, progress = objective.take(inside), mapped(lambda x: x[inside], progress)  # noqa: B023
             lanes = lanes[inside]
-        progress = solver.advance(objective, progress)
+        sighting = solver.sight(objective, progress)
         spent += len(lanes)
+        progress = sighting.progress
+        if bool(progress.running.any()):
+            progress = solver.proceed(objective, sighting)
     if done is not None:
         progress = _scattered(done, progress, lanes)
     return solution(progress, guess, spent)

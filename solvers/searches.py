@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, Self, TypeVar
 
@@ -113,13 +114,14 @@ class FullStep:
 
 @dataclass(frozen=True)
 class Foreseen:
-    """The first zero of the work that the objective expects along the direction; the whole step where it expects none, and where
-    it cannot tell. `samples` lengths at once, evenly spaced, then as many in the interval in which the sign changes, `rounds`
-    times, and a straight line at last; never below `shortest`."""
+    """The whole step where the objective expects it to end short of the zero of the work, or at it: |φ(1)| ≤ `balanced`·|φ(0)|;
+    also where it cannot tell. Else the first zero expected: `samples` lengths at once, evenly spaced, then as many in the interval
+    in which the sign changes, `rounds` times, and a straight line at last; never below `shortest`."""
 
     samples: int = 8
     rounds: int = 3
     shortest: float = 1e-4
+    balanced: float = 1e-2
 
     def length(self, start: Trial) -> Tensor:
         """See `FirstLength`."""
@@ -128,6 +130,16 @@ class Foreseen:
         if not isinstance(start.objective, Foreseeing):
             return full
         outlook = start.objective.outlook(start.evaluation, start.direction)
+        end = outlook(full[None])[0]
+        whole = (end < 0) | (end.abs() <= self.balanced * work.abs())
+        # what is in the host's own memory it may look at; asking a device would make it wait, so there the zeros are always sought
+        if work.device.type == "cpu" and bool(whole.numpy().all()):
+            return full
+        return torch.where(whole, full, self._first_zero(outlook, work))
+
+    def _first_zero(self, outlook: Callable[[Tensor], Tensor], work: Tensor) -> Tensor:
+        """φ(0) `[*batch]` → the length at which φ first vanishes, at most 1."""
+        full = torch.ones_like(work)
         share = torch.linspace(0, 1, self.samples + 1, dtype=work.dtype, device=work.device)[1:].reshape(-1, *[1] * work.ndim)
         low, high, low_work, high_work = torch.zeros_like(work), full, work, torch.zeros_like(work)
         passed = torch.zeros_like(work, dtype=torch.bool)

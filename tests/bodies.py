@@ -14,7 +14,8 @@ from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
 from pbfd_torch.simulator import Scene, Simulator
-from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce

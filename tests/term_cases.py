@@ -13,19 +13,25 @@ from pbfd_torch.articulation import Articulation
 from pbfd_torch.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.surface import Plane
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
 from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.terms.actuators import Actuator, Actuators
-from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
+from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.load import LinkLoad, StepContext, Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.terms.static_friction import StaticFriction
 from tests.random_trees import generator, moved_q, random_q, random_tree
+from tests.states import state_of
 
 NORMAL = (0.3, -0.5, 1.1)  # of the ground; scaled to unit length by HalfSpace
 
@@ -43,7 +49,7 @@ class Situation:
 
     def context(self, q: Tensor) -> StepContext:
         """The step's context for worlds like those of q, which may have further leading dimensions."""
-        state = State(self.state.q.expand_as(q), self.state.q_previous.expand_as(q))
+        state = state_of(self.state.q.expand_as(q), self.state.q_previous.expand_as(q))
         control = self.control if self.control is None else self.control.expand(*q.shape[:-1], self.control.shape[-1])
         return ImplicitEuler().context(self.articulation, state, self.dt, self.gravity, control)
 
@@ -77,7 +83,7 @@ def situation(seed: int, batch: tuple[int, ...] = (), turn: float = 0.1) -> Situ
     upper[..., x] = torch.where(side == 1, centre - gap, centre + 3 * gap)
     return Situation(
         dataclasses.replace(articulation, lower=lower, upper=upper),
-        State(now, before),
+        state_of(now, before),
         q,
         torch.tensor(0.02, dtype=torch.float64),
         torch.tensor([0.4, -0.2, -9.81], dtype=torch.float64),
@@ -110,7 +116,13 @@ def contact(
     gaps = ordered.diff(dim=-1)[..., quarter : depth.shape[-1] - quarter]
     at = gaps.argmax(-1, keepdim=True) + quarter
     middle = 0.5 * (ordered.gather(-1, at) + ordered.gather(-1, at + 1))
-    return dataclasses.replace(made, offset=made.offset - middle.squeeze(-1))
+    return raised(made, -middle)
+
+
+def raised(made: Contact, height: Tensor) -> Contact:
+    """A contact with a half-space whose surface is moved by a height `[*batch, 1]` along its normal."""
+    assert isinstance(made.surface, Plane)
+    return dataclasses.replace(made, surface=Plane(made.surface.normal, made.surface.offset + height))
 
 
 def actuators(s: Situation) -> Actuators:
@@ -160,6 +172,7 @@ class TermCase:
 ROUND = (Sphere(0.1), Capsule(0.05, 0.2))
 STICKING = CoulombFriction(0.7, slip_speed=50.0)  # one metre of slip over a step of .02 s: all slips are far below
 SLIDING = CoulombFriction(0.7, slip_speed=1e-4)  # two micrometres: all slips are far above
+WEAKENING = StaticFriction(0.7, 0.4, slip_speed=1e-4, stribeck_speed=10.0)  # falls over some decimetres
 
 CONTACTS = (
     TermCase("contact, α = 2", lambda s: contact(s, None), "potential"),
@@ -180,6 +193,14 @@ CONTACTS = (
     TermCase("PBFD as printed, β = .5, γ = 1.5", lambda s: contact(s, PbfdFriction.as_printed(5e4, 0.5, 1.5))),
     TermCase("PBFD as derived, β = 2, γ = .5", lambda s: contact(s, PbfdFriction.as_derived(5e4, 2.0, 0.5), 2.5)),
     TermCase("PBFD as printed, rolling", lambda s: contact(s, PbfdFriction.as_printed(5e4), shapes=ROUND)),
+    TermCase("PBD", lambda s: contact(s, PbdFriction(5e4))),
+    TermCase("PBD, β = 2, γ = 1.5", lambda s: contact(s, PbdFriction(5e4, 2.0, 1.5), 2.5)),
+    TermCase("PBD, rolling", lambda s: contact(s, PbdFriction(5e4), shapes=ROUND)),
+    TermCase("static, sticking", lambda s: contact(s, StaticFriction(0.7, 0.4, slip_speed=50.0))),
+    TermCase("static, weakening", lambda s: contact(s, WEAKENING)),
+    TermCase("static, weakening, rolling", lambda s: contact(s, WEAKENING, shapes=ROUND)),
+    TermCase("anchored, sticking", lambda s: contact(s, AnchoredFriction(0.7, stretch=1.0))),
+    TermCase("anchored, sliding, rolling", lambda s: contact(s, AnchoredFriction(0.7, stretch=1e-6), shapes=ROUND)),
 )
 TERMS = (
     TermCase("inertia", lambda s: Inertia(), "energy"),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pbfd_torch.articulation import force_scale
 from pbfd_torch.assembly import Balance, subtree_sum
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.kinematics import link_jacobians, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -22,6 +22,7 @@ from pbfd_torch.terms.load import LinkLoad, Term
 from tests.finite_differences import jacobian, relative_error
 from tests.point_bodies import point_bodies
 from tests.random_trees import SEEDS, generator, moved_q, random_q, random_tree
+from tests.states import state_of
 from tests.term_cases import ROUND, SLIDING, STICKING, Situation, actuators, coefficients, contact, dry_torque, no_load, situation
 
 all_trees = pytest.mark.parametrize("seed", [*SEEDS, 3])
@@ -82,7 +83,7 @@ def test_conservative_part_is_gradient_and_hessian_of_a_sum_over_points(seed: in
         total = (bodies.masses[..., None] * lag * lag).sum() / (2 * s.dt**2)
         poses = place(a, q).poses[made.link]
         centers = (poses[:, :3, :3] @ made.position[..., None]).squeeze(-1) + poses[:, :3, 3]
-        depth = (made.offset - centers @ made.normal).clamp_min(0)
+        depth = (-made.surface.field(centers).distance).clamp_min(0)
         total = total + 1e4 * (depth ** (exponent + 1)).sum() / (exponent + 1)
         x = q[t.scalar_q]
         above, below = (x - a.upper[t.scalar_v]).clamp_min(0), (a.lower[t.scalar_v] - x).clamp_min(0)
@@ -139,7 +140,7 @@ def test_stiffness_is_the_jacobian_where_no_force_acts(seed: int) -> None:
     """B, the curvature of the tree, is linear in the forces: at T = T̂ (no inertial force) J equals its stiffness part."""
     s = situation(seed)
     still = dataclasses.replace(s, gravity=torch.zeros(3, dtype=torch.float64))
-    still = dataclasses.replace(still, state=State(s.q, s.q))
+    still = dataclasses.replace(still, state=state_of(s.q, s.q))
     balance = still.balance([Inertia()], s.q)
     size = float(balance.jacobian.abs().max())
     assert float(balance.residual.abs().max()) <= 1e-12 * size
@@ -153,7 +154,7 @@ def test_newton_converges_quadratically(seed: int) -> None:
     a = s.articulation
     before = moved_q(a, s.state.q, seed + 9, 1e-3)
     terms: list[Term] = [Inertia(), JointSprings(coefficients(s, 20.0), s.state.q), Armature(coefficients(s, 0.01))]
-    context = ImplicitEuler().context(a, State(s.state.q, before), s.dt, s.gravity, None)
+    context = ImplicitEuler().context(a, state_of(s.state.q, before), s.dt, s.gravity, None)
     objective = BalanceObjective.of_step(a, terms, context, force_scale(a, 9.81))
     q, norms = s.state.q, []
     for _ in range(5):

@@ -435,14 +435,14 @@ def test_info_of_a_shipped_robot(pbfd: Pbfd) -> None:
     foot = data["joints"][-1]
     assert foot["range"] == pytest.approx([-math.pi / 4, math.pi / 4])
     assert (foot["armature"], foot["damping"]) == (1, 1)
-    assert data["obstacles"] == [{"name": "floor", "normal": [0, 0, 1], "offset_m": 0}]
+    assert data["obstacles"] == [{"name": "floor", "shape": "HalfSpace", "normal": [0, 0, 1], "offset_m": 0}]
     assert data["actuators"] == ["thigh", "leg", "foot"]
 
     ran = pbfd("info", "hopper")
     assert ran.status == 0
     assert ran.out.startswith("hopper: 4 links, 6 degrees of freedom, 3 actuators, 15.82")
     assert re.search(r"^foot_joint +hinge +foot +-0\.7854 … 0\.7854 +1 +1 *$", ran.out, re.MULTILINE)
-    assert "obstacle: floor, half-space with normal [0.0, 0.0, 1.0] at 0 m\n" in ran.out
+    assert "obstacle: floor, HalfSpace at 0 m along [0.0, 0.0, 1.0]\n" in ran.out
 
 
 def test_info_of_a_urdf(pbfd: Pbfd) -> None:
@@ -456,15 +456,20 @@ def test_info_of_a_urdf(pbfd: Pbfd) -> None:
     assert out.endswith("not modelled:\n" + "".join(f"  {line}\n" for line in free["not_modelled"]))
 
 
-def test_info_lists_what_is_not_modelled(pbfd: Pbfd) -> None:
-    """Gymnasium's humanoid asks for contact between its links; long names stay whole in the tables."""
+def test_info_lists_what_is_not_modelled(pbfd: Pbfd, tmp_path: Path) -> None:
+    """Everything that Gymnasium's humanoid asks for is modelled, rolling friction is not; long names stay whole in the tables."""
     file = gymnasium_file("humanoid")
     data = pbfd("info", file, "--json").data
     assert (data["nv"], data["nu"], len(data["links"])) == (23, 17, 13)
-    assert data["not_modelled"] == ["contact between links"]
+    assert data["not_modelled"] == []
     ran = pbfd("info", file)
     assert (ran.status, ran.err) == (0, "")
-    assert ran.out.endswith("not modelled:\n  contact between links\n")
+    assert ran.out.endswith("not modelled: nothing\n")
+    ball = tmp_path / "ball.xml"
+    ball.write_text("<mujoco><worldbody><body><freejoint/><geom name='g' size='0.1' condim='6'/></body></worldbody></mujoco>")
+    line = "torsional and rolling friction (condim 4, 6) (1): g"
+    assert pbfd("info", ball, "--json").data["not_modelled"] == [line]
+    assert pbfd("info", ball).out.endswith(f"not modelled:\n  {line}\n")
     assert re.search(r"^right_shoulder1 +hinge +right_upper_arm +-1\.484 … 1\.047 ", ran.out, re.MULTILINE)
 
 

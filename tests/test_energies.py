@@ -16,8 +16,9 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement, place, retract
 from pbfd_torch.rotations import log_jacobian_left
 from pbfd_torch.terms.actuators import Actuator, Actuators
-from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor, slip_work
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.lagged_friction import LaggedFriction
 from pbfd_torch.terms.load import Frictional, Potential, Term
@@ -176,7 +177,7 @@ def test_slip_work() -> None:
 
     def integral(low: Tensor, high: Tensor) -> Tensor:
         at = 0.5 * (low + high) + offset * (high - low)
-        return (weight * slip_factor(at, width)[0] * at).sum(0) * (high - low)
+        return (weight * slip_factor(at, width) * at).sum(0) * (high - low)
 
     expected = integral(torch.zeros_like(y), y.clamp_max(width)) + integral(width.expand_as(y), y.clamp_min(width))
     torch.testing.assert_close(slip_work(y, width), expected, rtol=1e-14, atol=0)
@@ -216,15 +217,14 @@ def test_widened_friction_is_flatter_at_zero_slip() -> None:
 
     made = contact(s, SLIDING)
     touched = made.prepare(prepared_at)
-    zero = torch.zeros(3, dtype=torch.float64)
     for term in (made, made.lagged(touched, moving)):
         wider = term.widened(8.0)
         torch.testing.assert_close(wider.load(touched, moving).moment, term.load(touched, moving).moment, rtol=1e-14, atol=1e-12)
         assert wider.friction is not None
         assert term.friction is not None
-        push, push_slope = made.normal_force.force(made.depth(moving))
-        arguments = push, push_slope, made.depth(moving), zero.expand(*push.shape, 3), touched.dt
-        steep, flat = term.friction.force(*arguments)[2], wider.friction.force(*arguments)[2]
+        push, _ = made.normal_force.force(made.depth(moving))
+        arguments = push, made.depth(moving), torch.zeros_like(push), touched.dt
+        steep, flat = term.friction.drag(*arguments), wider.friction.drag(*arguments)
         assert float(steep.abs().max()) > 0
         torch.testing.assert_close(flat, steep / 8, rtol=1e-15, atol=0)
     law = PbfdFriction.as_printed(5e4)
@@ -244,14 +244,13 @@ def test_a_law_without_slip_energy_stays_as_it_is() -> None:
     """A friction law without `slip_energy` and `widened`, as README allows: the contact is not lagged and not widened."""
 
     class Viscous:
-        def force(
-            self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor
-        ) -> tuple[Tensor, Tensor, Tensor]:
-            eye = torch.eye(3, dtype=slip.dtype)
-            return -normal[..., None] * slip, -normal_slope[..., None] * slip, -normal[..., None, None] * eye
-
         def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
             return normal
+
+        def drag_slopes(
+            self, normal: Tensor, normal_slope: Tensor, depth: Tensor, size: Tensor, dt: Tensor
+        ) -> tuple[Tensor, Tensor]:
+            return normal_slope, torch.zeros_like(size)
 
         def take(self, worlds: Worlds) -> Self:
             return self

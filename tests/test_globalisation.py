@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.directions import Direction, GaussNewtonLm, JtjLm, Lm, Newton, ProjectedNewton, projected
+from pbfd_torch.solvers.directions import Direction, GaussNewtonLm, JtjLm, Lm, Model, Newton, ProjectedNewton, projected
 from pbfd_torch.solvers.lbfgs import Lbfgs
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.solvers.searches import Backtracking, Bracket, Secant, Touching, Trial, TrustRegion, WorkSearch
@@ -210,6 +210,31 @@ def test_lbfgs_memory_is_a_queue() -> None:
         q = q + step
         model = rule.model(objective, Point(q, h), model, step, torch.tensor(False))
     assert model[1].flatten().tolist() == [3.0, 2.0]
+
+
+def test_no_direction_is_sought_where_all_have_arrived() -> None:
+    """Newton on a quadratic: two evaluations, one direction, and the same end in the round that serves other schedules."""
+    sought: list[int] = []
+
+    class Counted(Newton):
+        def step(self, model: Model, damping: Tensor) -> Tensor:
+            sought.append(1)
+            return super().step(model, damping)
+
+    given = problem("quadratic")
+    objective, solver = given.objective(torch.float64), Descent(Counted())
+    guess = given.start(torch.float64).expand(3, -1)
+    solution = solver.solve(objective, guess)
+    assert solution.evaluations.tolist() == [2, 2, 2]
+    assert solution.iterations.tolist() == [1, 1, 1]
+    assert len(sought) == 1
+    progress = solver.begin(objective, guess)
+    for _ in range(2):
+        progress = solver.advance(objective, progress)
+    assert not bool(progress.running.any())
+    assert torch.equal(progress.q, solution.q)
+    assert torch.equal(progress.error, solution.residual_norm)
+    assert torch.equal(progress.status, solution.status)
 
 
 # Squares --------------------------------------------------------------------------------------------------------------

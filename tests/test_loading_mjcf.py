@@ -1,6 +1,7 @@
 """MJCF files: what a robot becomes, what is left out and said so, and the words about files that cannot be used.
 
-Kinematics, dynamics and joint forces of MJCF robots are compared with MuJoCo in test_against_mujoco.py."""
+Kinematics, dynamics and joint forces of MJCF robots are compared with MuJoCo in test_against_mujoco.py; obstacles and
+who touches whom are in test_loading_collisions.py."""
 
 from __future__ import annotations
 
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.pairing import touch
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Sphere
 from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
 from pbfd_torch.loading import Robot, load_mjcf, load_robot
@@ -143,6 +146,8 @@ def test_friction_and_condim(tmp_path: Path) -> None:
 
 def test_planes_on_the_world_are_obstacles(robot: Robot) -> None:
     floor, ramp = robot.obstacles
+    assert isinstance(floor, HalfSpace)
+    assert isinstance(ramp, HalfSpace)
     assert (floor.name, floor.friction, floor.priority) == ("floor", 0.7, 0)
     assert floor.normal == pytest.approx((math.sin(0.2), -math.sin(0.1) * math.cos(0.2), math.cos(0.1) * math.cos(0.2)))
     assert floor.offset == pytest.approx(-0.5 * math.cos(0.1) * math.cos(0.2))
@@ -154,9 +159,10 @@ def test_planes_on_the_world_are_obstacles(robot: Robot) -> None:
 def test_explicit_pairs_touch_whatever_their_bits(robot: Robot) -> None:
     shin = next(x for x in robot.colliders if x.name == "shin")
     floor, ramp = robot.obstacles
-    assert shin.group & ramp.mask
-    assert (shin.group & floor.mask, floor.group & shin.mask, ramp.group & shin.mask) == (0, 0, 0)
-    assert not any(x.group & ramp.mask & ~0xFFFFFFFF for x in robot.colliders if x.name != "shin")
+    assert isinstance(floor, HalfSpace)
+    assert isinstance(ramp, HalfSpace)
+    assert (touch(shin, ramp), touch(shin, floor)) == (True, False)
+    assert [x.name for x in robot.colliders if touch(x, ramp)] == ["upper", "palm", "tip", "wedge", "shin"]
 
 
 @pytest.mark.parametrize(
@@ -202,7 +208,6 @@ def test_left_out_features_are_listed_and_warned_about() -> None:
     assert robot.not_modelled == (
         "actuators with activation dynamics (1), they do nothing: filtered",
         "actuators with transmission site (1), they do nothing: site_thrust",
-        "contact between links",
         "friction of contact pairs: that of their geoms is used",
     )
     assert [str(w.message) for w in caught] == [f"{JOINTS}: not modelled: {line}" for line in robot.not_modelled]
@@ -246,21 +251,33 @@ def test_left_out_features_are_listed_and_warned_about() -> None:
         (BODY.replace("<joint", "<joint stiffness='1 2'"), "", "springs that are not linear (1): j"),
         (BODY.replace("<joint", "<joint damping='1 2'"), "", "damping that is not linear (1): j"),
         (BODY.replace("<geom", "<geom condim='4'"), "", "torsional and rolling friction (condim 4, 6) (1): g"),
+        (BODY, "<option><flag filterparent='disable'/></option>", "contact between a body and its parent (filterparent is off)"),
+        (
+            BODY.replace("<geom", "<geom name='hill' type='hfield' hfield='h'/><geom"),
+            "<asset><hfield name='h' nrow='2' ncol='2' size='1 1 1 1'/></asset>",
+            "geoms that cannot collide: hill (hfield)",
+        ),
         (
             BODY + "<geom name='wall' type='box' size='1 1 1'/>",
-            "",
-            "geoms fixed to the world, other than planes, are no obstacles (1): wall",
-        ),
-        (BODY + BODY.replace("'b'", "'c'").replace("'j'", "'k'").replace("'g'", "'h'"), "", "contact between links"),
-        (
-            BODY + "<geom name='floor' type='plane' size='1 1 1'/>",
-            "<contact><exclude body1='world' body2='b'/></contact>",
-            "excluded contact with the world (1): b",
+            "<contact><pair geom1='wall' geom2='g'/></contact>",
+            "friction of contact pairs: that of their geoms is used",
         ),
     ],
 )
 def test_left_out(tmp_path: Path, bodies: str, more: str, line: str) -> None:
     assert loaded(tmp_path, bodies, more).not_modelled == (line,)
+
+
+def test_pairs_that_other_rules_bar_are_listed(tmp_path: Path) -> None:
+    """MuJoCo lets an explicit pair touch even between a body and its parent, or where it is excluded."""
+    bodies = BODY.replace("</body>", "<body name='c'><joint/><geom name='h' size='1'/></body></body>")
+    bodies += "<body name='d'><joint/><geom name='i' size='1'/></body>"
+    pairs = "<pair name='p' geom1='g' geom2='h'/><pair name='q' geom1='h' geom2='i'/><pair name='r' geom1='g' geom2='i'/>"
+    found = loaded(tmp_path, bodies, f"<contact>{pairs}<exclude body1='c' body2='d'/></contact>").not_modelled
+    assert found == (
+        "friction of contact pairs: that of their geoms is used",
+        "contact pairs of bodies that are joined or excluded (2): p, q",
+    )
 
 
 def test_what_has_no_effect_is_not_listed(tmp_path: Path) -> None:

@@ -303,13 +303,6 @@ def test_a_plain_robot_leaves_nothing_out(tmp_path: Path) -> None:
         assert loaded(tmp_path, link("a"), link("b"), joint("j", "a", "b")).not_modelled == ()
 
 
-def test_shapes_of_standing_links_are_left_out(tmp_path: Path) -> None:
-    shape = "<collision><geometry><sphere radius='1'/></geometry></collision>"
-    with pytest.warns(NotModelledWarning, match=r"fixed to the world are no obstacles \(1\)"):
-        robot = loaded(tmp_path, link("world", shape), link("b"), joint("j", "world", "b"))
-    assert robot.colliders == ()
-
-
 # beside ---------------------------------------------------------------------------------------------------------------------
 
 

@@ -33,7 +33,8 @@ NONE = torch.zeros(1, dtype=torch.float64)
 def objective(s: Situation, terms: tuple[Term, ...]) -> BalanceObjective:
     context = s.context(s.q)
     scale = torch.ones(s.articulation.nv, dtype=torch.float64)
-    return BalanceObjective(s.articulation, terms, context, [term.prepare(context) for term in terms], scale, scale, 0 * scale)
+    prepared = [term.prepare(context) for term in terms]
+    return BalanceObjective(s.articulation, terms, context, (), prepared, scale, scale, 0 * scale)
 
 
 def rolls(term: Term) -> bool:
@@ -70,7 +71,8 @@ def test_points_move_to_second_order(case: TermCase) -> None:
     prepared = alone.prepared[0]
     d = tangent(s.articulation, 3, (3,))
     assert isinstance(term, Contact)
-    outlook = term.outlook(prepared, Motion(place(s.articulation, s.q), d))
+    placement = place(s.articulation, s.q)
+    outlook = term.load(prepared, placement).outlook(Motion(placement, d))
     with_inertia, only_inertia = objective(s, (Inertia(), term)), objective(s, (Inertia(),))
 
     def true(a: float) -> Tensor:
@@ -116,6 +118,25 @@ def test_first_length_is_the_first_zero_of_the_work() -> None:
     assert float(found[0, 0]) == pytest.approx(0.25, abs=1e-12)
     assert float(found[1, 1]) == 1.0
     assert first_length(work, at_zero, FullStep()).tolist() == [[1.0, 1.0], [1.0, 1.0]]
+
+
+def test_whole_step_where_its_end_will_do() -> None:
+    """Worlds whose work ends below zero, though it was above in between, or at a hundredth of the start's, take the whole step; one
+    at two hundredths takes the zero. Each does alone what it does among the others, which need no look in between."""
+
+    def works(a: Tensor) -> Tensor:
+        return torch.stack(((a[..., 0] - 0.3) * (0.7 - a[..., 0]), 1.009 * a[..., 1] - 1, 1.02 * a[..., 2] - 1), -1)
+
+    at_zero = works(torch.zeros(1, 3, dtype=torch.float64))[0]
+    assert first_length(works, at_zero, Foreseen()).tolist() == [1.0, 1.0, pytest.approx(1 / 1.02, abs=1e-12)]
+    looked_at: list[int] = []
+
+    def first_two(a: Tensor) -> Tensor:
+        looked_at.append(len(a))
+        return works(torch.cat((a, a[..., :1]), -1))[..., :2]
+
+    assert first_length(first_two, at_zero[:2], Foreseen()).tolist() == [1.0, 1.0]
+    assert looked_at == [1]
 
 
 def test_first_length_where_the_outlook_fails() -> None:

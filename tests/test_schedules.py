@@ -11,7 +11,6 @@ from torch import Tensor
 from pbfd_torch.asynchronous import AsynchronousRollout
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.implicit_euler import State
 from pbfd_torch.models import SCENES
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
@@ -22,6 +21,7 @@ from pbfd_torch.solvers.named import OnSquares, lbfgs
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.workers import Workers
 from tests.random_trees import generator
+from tests.states import state_of
 
 ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor" and f.name != "lanes"]
 
@@ -161,7 +161,7 @@ def test_worker_processes_give_the_numbers_of_one() -> None:
         for _ in range(2):
             assert_equal(workers.rollout(simulator, state, steps=6), straight)
         with pytest.raises(InputError, match="1 worlds for 2 workers: must be at least one each"):
-            workers.rollout(simulator, State(state.q[:1], state.q_previous[:1]), steps=1)
+            workers.rollout(simulator, state_of(state.q[:1], state.q_previous[:1]), steps=1)
 
 
 def test_bad_input_is_named() -> None:
@@ -174,7 +174,7 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match=r"controls have shape \(3, 2, 1\): must be \(4, 2, 0\)"):
         AsynchronousRollout(simulator, state, 4, torch.zeros(3, 2, 1, dtype=torch.float64))
     with pytest.raises(InputError, match="must be \\[worlds, nq\\]"):
-        AsynchronousRollout(simulator, State(state.q[0], state.q_previous[0]), 4)
+        AsynchronousRollout(simulator, state_of(state.q[0], state.q_previous[0]), 4)
     with pytest.raises(InputError, match="the solver is a OnSquares: must be a Descent or Fallbacks"):
         AsynchronousRollout(Simulator(setup.scene, 0.05, solver=OnSquares(lbfgs())), state, 4)
     with pytest.raises(InputError, match="count is 0: must be ≥ 1"):

@@ -24,6 +24,7 @@ from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from tests.random_trees import generator
+from tests.states import state_of
 
 # few evaluations a stage: detours and exhausted budgets become common and stay cheap
 HASTY = Fallbacks(Descent(max_evaluations=8), Descent(max_evaluations=12), detours=(Continuation(((1.0, 1e-2),)),))
@@ -156,7 +157,7 @@ def test_poisoned_state_harms_no_other_world(dtype: torch.dtype, where: str) -> 
     clean = simulator.initial_state(*scattered(setup, 5))
     q, q_previous = clean.q.clone(), clean.q_previous.clone()
     (q if where == "q" else q_previous)[2, 9] = math.nan
-    dirty = State(q, q_previous)
+    dirty = state_of(q, q_previous)
     others = [0, 1, 3, 4, 5]
     for k in range(10):
         clean, expected = simulator.step(clean)
@@ -215,7 +216,7 @@ def test_compaction_changes_no_world(lagged: bool) -> None:
     whole = solver.solve(objective.lagged(landing.q) if lagged else objective, objective.guess, landing.q)
     assert int(whole.evaluations.sum()) <= whole.lanes < 64 * int(whole.evaluations.max())
     for k in (0, 59, *range(60, 64)):
-        part = simulator.objective(State(landing.q[k], landing.q_previous[k]))
+        part = simulator.objective(state_of(landing.q[k], landing.q_previous[k]))
         alone = solver.solve(part.lagged(landing.q[k]) if lagged else part, part.guess, landing.q[k])
         assert_same(whole, k, alone)
 

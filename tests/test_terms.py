@@ -14,13 +14,15 @@ from pbfd_torch.articulation import Articulation, Joint, JointKind, Link, homoge
 from pbfd_torch.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.surface import Plane
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.kinematics import place, retract
 from pbfd_torch.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
 from pbfd_torch.terms.actuators import Actuator, Actuators
-from pbfd_torch.terms.contact import Contact, ContactPoints, FrictionLaw
-from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor
+from pbfd_torch.terms.contact import Contact, ContactPoints
+from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor, slip_factor_slope
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -30,7 +32,8 @@ from pbfd_torch.terms.normal_force import NormalForce, power
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS
-from tests.term_cases import CONTACTS, ROUND, SLIDING, STICKING, TERMS, Situation, TermCase, contact, situation
+from tests.states import state_of
+from tests.term_cases import CONTACTS, ROUND, SLIDING, STICKING, TERMS, Situation, TermCase, contact, raised, situation
 
 all_terms = pytest.mark.parametrize("case", TERMS, ids=str)
 all_contacts = pytest.mark.parametrize("case", CONTACTS, ids=str)
@@ -109,7 +112,7 @@ def test_residual_and_jacobian_derive_from_the_energy(case: TermCase, seed: int)
     def energy(delta: Tensor) -> Tensor:
         placement = place(s.articulation, retract(s.articulation, s.q, delta))
         if case.stores == "potential":
-            return term.potential(placement)  # type: ignore[attr-defined, no-any-return, unused-ignore]
+            return term.potential(placement, s.state.time)  # type: ignore[attr-defined, no-any-return, unused-ignore]
         return term.energy(prepared, placement)  # type: ignore[attr-defined, no-any-return, unused-ignore]
 
     at = torch.zeros(s.articulation.nv, dtype=torch.float64)
@@ -144,12 +147,12 @@ def test_no_load_where_nothing_touches(case: TermCase) -> None:
     made = case.build(s)
     assert isinstance(made, Contact)
     placement = place(s.articulation, s.q)
-    apart = dataclasses.replace(made, offset=made.offset - made.depth(placement).amax(-1) - 1e-9)
+    apart = raised(made, -made.depth(placement).amax(-1, keepdim=True) - 1e-9)
     load = apart.load(apart.prepare(s.context(s.q)), placement)
     assert float(apart.depth(placement).max()) <= 0
     assert bool((load.moment == 0).all())
     assert bool((load.stiffness == 0).all())
-    assert bool((apart.potential(placement) == 0).all())
+    assert bool((apart.potential(placement, s.state.time) == 0).all())
 
 
 @all_contacts
@@ -164,8 +167,9 @@ def test_no_force_at_depth_zero(case: TermCase) -> None:
     assert bool((push == 0).all())
     assert bool((slope == 0).all())
     if made.friction is not None:
-        for slip in (torch.zeros(4, 3, dtype=torch.float64), torch.ones(4, 3, dtype=torch.float64)):
-            for value in made.friction.force(push, slope, zero, slip, s.dt.expand(4)):
+        for size in (torch.zeros(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64)):
+            assert bool((made.friction.drag(push, zero, size, s.dt) == 0).all())
+            for value in made.friction.drag_slopes(push, slope, zero, size, s.dt):
                 assert bool((value == 0).all())
 
 
@@ -178,7 +182,7 @@ def test_no_load_inside_the_limits() -> None:
     load = limits.load(None, place(free, s.q))
     assert bool((load.residual == 0).all())
     assert bool((load.stiffness == 0).all())
-    assert bool((limits.potential(place(free, s.q)) == 0).all())
+    assert bool((limits.potential(place(free, s.q), s.state.time) == 0).all())
 
 
 @pytest.mark.parametrize("case", [c for c in TERMS if "dry" in c.name or "damping" in c.name], ids=str)
@@ -216,7 +220,7 @@ def moved_scene(s: Situation, turn: Tensor, shift: Tensor) -> tuple[Situation, T
     change = torch.eye(a.nv, dtype=torch.float64)
     for rows in t.free_v:
         change[rows[:, None], rows] = rotation
-    state = State(moved(s.state.q), moved(s.state.q_previous))
+    state = state_of(moved(s.state.q), moved(s.state.q_previous))
     return dataclasses.replace(s, articulation=a, state=state, q=moved(s.q), gravity=s.gravity @ rotation.mT), change, moved
 
 
@@ -231,8 +235,9 @@ def test_physics_does_not_depend_on_the_frame(case: TermCase, axis: tuple[float,
     term = case.build(s)
     term_there = term
     if isinstance(term, Contact):
-        normal = quaternion_matrix(quaternion_exp(turn)) @ term.normal
-        term_there = dataclasses.replace(term, normal=normal, offset=term.offset + normal @ shift)
+        assert isinstance(term.surface, Plane)
+        normal = quaternion_matrix(quaternion_exp(turn)) @ term.surface.normal
+        term_there = dataclasses.replace(term, surface=Plane(normal, term.surface.offset + normal @ shift))
     elif isinstance(term, JointSprings):
         term_there = dataclasses.replace(term, rest=in_frame(term.rest))
     here, moved = s.balance([term], s.q), there.balance([term_there], there.q)
@@ -264,14 +269,20 @@ def test_batch_equals_its_worlds(case: TermCase) -> None:
     assert whole.residual.shape == (2, 3, s.articulation.nv)
     for i, j in ((0, 0), (1, 2)):
         a = dataclasses.replace(s.articulation, lower=s.articulation.lower[i, j], upper=s.articulation.upper[i, j])
-        state = State(s.state.q[i, j], s.state.q_previous[i, j])
+        state = state_of(s.state.q[i, j], s.state.q_previous[i, j])
         control = None if s.control is None else s.control[i, j]
         one = dataclasses.replace(s, articulation=a, state=state, q=s.q[i, j], control=control)
-        one_term = dataclasses.replace(term, offset=term.offset[i, j]) if isinstance(term, Contact) else term
+        one_term = of_world(term, (i, j)) if isinstance(term, Contact) else term
         alone = one.balance([one_term], one.q)
         size = float(whole.residual.abs().max())
         torch.testing.assert_close(whole.residual[i, j], alone.residual, rtol=0, atol=1e-13 * size)
         torch.testing.assert_close(whole.jacobian[i, j], alone.jacobian, rtol=0, atol=1e-13 * float(whole.jacobian.abs().max()))
+
+
+def of_world(made: Contact, world: tuple[int, ...]) -> Contact:
+    """A contact with the ground height of one world."""
+    assert isinstance(made.surface, Plane)
+    return dataclasses.replace(made, surface=Plane(made.surface.normal, made.surface.offset[world]))
 
 
 @pytest.mark.parametrize("friction", [CoulombFriction, PbfdFriction], ids=lambda f: f.__name__)
@@ -290,13 +301,11 @@ def test_contact_parameters_may_differ_from_world_to_world(friction: type) -> No
     a = dataclasses.replace(s.articulation, pseudo_inertia=mass * s.articulation.pseudo_inertia)
     whole = dataclasses.replace(s, articulation=a).balance([Inertia(), made], s.q)
     for k in range(3):
-        one_made = dataclasses.replace(
-            base, offset=base.offset[k], normal_force=NormalForce(float(stiffness[k])), friction=law(share[k])
-        )
+        one_made = dataclasses.replace(of_world(base, (k,)), normal_force=NormalForce(float(stiffness[k])), friction=law(share[k]))
         one_a = dataclasses.replace(
             s.articulation, pseudo_inertia=a.pseudo_inertia[k], lower=s.articulation.lower[k], upper=s.articulation.upper[k]
         )
-        state = State(s.state.q[k], s.state.q_previous[k])
+        state = state_of(s.state.q[k], s.state.q_previous[k])
         one = dataclasses.replace(s, articulation=one_a, state=state, q=s.q[k], control=None)
         alone = one.balance([Inertia(), one_made], one.q)
         torch.testing.assert_close(whole.residual[k], alone.residual, rtol=1e-12, atol=1e-10)
@@ -370,7 +379,7 @@ def contact_points(
     """What the contact sees over a step from one configuration to the next."""
     time = torch.tensor(dt, dtype=torch.float64)
     gravity = torch.zeros(3, dtype=torch.float64)
-    prepared = made.prepare(ImplicitEuler().context(articulation, State(before, before), time, gravity, None))
+    prepared = made.prepare(ImplicitEuler().context(articulation, state_of(before, before), time, gravity, None))
     placement = place(articulation, after)
     return made.points(prepared, placement), made.load(prepared, placement)
 
@@ -398,12 +407,12 @@ def test_slip_factor_is_smooth() -> None:
     """s·y rises from 0 to 1 at y = w with slope 2/w at 0 and 0 at w, and stays 1: both s and its slope are continuous at w."""
     width = torch.tensor(1e-3, dtype=torch.float64)
     eps = 1e-9
-    below, above = (slip_factor(width * (1 + x), width) for x in (-eps, eps))
-    assert float(below[0] * width) == pytest.approx(1.0, abs=1e-8)
-    assert float(below[0]) == pytest.approx(float(above[0]), rel=1e-8)
-    assert float(below[1]) == pytest.approx(float(above[1]), rel=1e-8)
+    below, above = width * (1 - eps), width * (1 + eps)
+    assert float(slip_factor(below, width) * width) == pytest.approx(1.0, abs=1e-8)
+    for function in (slip_factor, slip_factor_slope):
+        assert float(function(below, width)) == pytest.approx(float(function(above, width)), rel=1e-8)
     y = torch.linspace(0.0, 3e-3, 301, dtype=torch.float64)
-    force = slip_factor(y, width)[0] * y
+    force = slip_factor(y, width) * y
     assert bool((force.diff() >= -1e-12).all())
     assert float(force[0]) == 0
     assert float(force[1:2] / y[1:2]) == pytest.approx(2 / 1e-3, rel=1e-2)
@@ -569,7 +578,7 @@ def test_damping_of_a_free_spin() -> None:
     before = pose((0.0, 0.0, 0.0), (0.2, -0.1, 0.5))
     step = torch.tensor([0.1, 0.0, -0.2, 0.3, -0.4, 0.2], dtype=torch.float64)
     after = retract(articulation, before, step)
-    moving = dataclasses.replace(s, state=State(before, before), q=after, control=None)
+    moving = dataclasses.replace(s, state=state_of(before, before), q=after, control=None)
     damping = torch.tensor([2.0, 2.0, 2.0, 0.5, 0.5, 0.5], dtype=torch.float64)
     residual = moving.balance([JointDamping(damping)], after).residual
     torch.testing.assert_close(residual, damping * step / float(s.dt), rtol=1e-12, atol=1e-12)

@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
+from pbfd_torch.contact.surface import Plane
 from pbfd_torch.kinematics import place
 from pbfd_torch.terms.actuators import Actuators
-from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -115,9 +117,10 @@ def spread(value: float | Tensor, lead: tuple[int, ...], event: tuple[int, ...] 
 def tilted(s: Situation, lead: tuple[int, ...]) -> Contact:
     """A contact of points whose ground has another normal, and whose candidates other places, in every world."""
     made = contact(s, CoulombFriction(0.7, 50.0))
-    normal = made.normal + 0.02 * torch.randn(*lead, 3, dtype=torch.float64, generator=generator(29))
+    assert isinstance(made.surface, Plane)
+    normal = made.surface.normal + 0.02 * torch.randn(*lead, 1, 3, dtype=torch.float64, generator=generator(29))
     unit = normal / torch.linalg.vector_norm(normal, dim=-1, keepdim=True)
-    return dataclasses.replace(made, normal=unit, position=spread(made.position, lead, (POINTS, 3)))
+    return dataclasses.replace(made, surface=Plane(unit, made.surface.offset), position=spread(made.position, lead, (POINTS, 3)))
 
 
 def lagged(s: Situation, lead: tuple[int, ...]) -> Contact:
@@ -257,7 +260,7 @@ def test_only_what_differs_is_copied(friction: Callable[[Tensor], FrictionLaw]) 
     part = made.take(worlds)
     assert part is not made
     assert part.friction is not made.friction
-    for name in ("link", "position", "radius", "margin", "normal", "offset", "normal_force", "names"):
+    for name in ("link", "position", "radius", "margin", "surface", "normal_force", "names"):
         assert getattr(part, name) is getattr(made, name)
     shared = contact(s, friction(torch.full((POINTS,), 0.5, dtype=torch.float64)))
     assert shared.take(worlds) is shared

@@ -1,17 +1,16 @@
-"""Contact of candidate points with a half-space: depth, slip, forces, and their exact stiffness.
+"""Contact of candidate points with one solid of the world: a half-space or an obstacle, still or in prescribed motion.
 
-A candidate is a centre c fixed in a link, a radius ρ ≥ 0 and a margin δ ≥ 0. Its depth is d = ρ + δ − (n·c − h), its force
-acts at c − ρn, and its slip over the step is u = (I − nnᵀ)[(c − c_n) − ρ φ × n] with φ = log(R R_nᵀ): zero for pure rolling
-(METHOD §4).
+A candidate is a centre fixed in a link, a radius ρ ≥ 0 and a margin δ ≥ 0; `touching` has the formulas.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -19,45 +18,40 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.obstacle import Carrier, Obstacle
 from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Motion, Placement
-from pbfd_torch.rotations import log_jacobian_left, quaternion_matrix, rotation_log, skew
-from pbfd_torch.terms.lagged_friction import LaggedFriction, SlipLaw
-from pbfd_torch.terms.load import LinkLoad, StepContext
-from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.rotations import quaternion_matrix, rotation_log
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
+from pbfd_torch.terms.contact_outlook import contact_outlook
+from pbfd_torch.terms.friction_law import FrictionLaw
+from pbfd_torch.terms.grouping import Grouping
+from pbfd_torch.terms.inertia import inertia_stiffness
+from pbfd_torch.terms.lagged_friction import lagged_law, widened_law
+from pbfd_torch.terms.load import ForetellingLoad, StepContext
+from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
+from pbfd_torch.terms.restitution import Restitution
+from pbfd_torch.terms.touching import ContactForce, Touching, arm, cross, extended, mapped, turned
 from pbfd_torch.worlds import Worlds, replaced
-
-
-class FrictionLaw(Protocol):
-    """Tangential force of a contact law."""
-
-    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Force, d force/d depth, d force/d slip from N, dN/dd, d `[*, n]`, u `[*, n, 3]` and dt (broadcastable to `[*, n]`)."""
-        ...
-
-    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
-        """g ≥ 0 `[*, n]`, where the force is −g u, from N, d and ‖u‖ `[*, n]`."""
-        ...
-
-    def take(self, worlds: Worlds) -> Self:
-        """The same law with the parameters of some worlds."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedContact:
     dt: Tensor  # [*batch, 1]
-    centers: Tensor  # [*batch, npoint, 3] at the start of the step
-    rotations: Tensor  # [*batch, nlink, 3, 3] at the start of the step
-    on_link: Tensor  # [nlink, npoint] 1 where the candidate is the link's
+    centers: Tensor  # [*batch, npoint, 3] where the solid has carried the centres of the start by the end of the step
+    rotations: Tensor  # [*batch, nlink, 3, 3] the links' at the start, carried likewise
+    frame: Tensor | None  # [*batch, 1, 3, 4] the solid's at the end of the step; None: the world's
+    anchor: Tensor | None  # [*batch, npoint, 3] what the anchors are behind by, in world axes at the end of the step
+    bounce: Tensor | None  # [*batch, npoint] how far the surface is moved out to throw a candidate back
 
 
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
     """What the contacts of one placement look like, for records and pictures.
 
-    Attributes: `point` `[*, n, 3]` where the force acts [m]; `depth` `[*, n]` > 0 inside the obstacle [m]; `normal` `[*, 3]`;
+    Attributes: `point` `[*, n, 3]` where the force acts [m]; `depth` `[*, n]` > 0 inside the obstacle [m]; `normal` `[*, n, 3]`;
     `force` `[*, n, 3]` on the body [N]; `slip` `[*, n, 3]` over the step [m]."""
 
     point: Tensor
@@ -69,16 +63,19 @@ class ContactPoints:
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Candidate points against one half-space.
+    """Candidates against one solid.
 
     Attributes:
         link: `[npoint]` index of the link that carries each candidate.
         position: `[*, npoint, 3]` centre in the link's frame [m].
         radius: `[npoint]` [m] ≥ 0.
         margin: `[npoint]` [m] ≥ 0: skin in which the force sets in already.
-        normal: `[*, 3]` unit normal out of the obstacle; offset: `[*]` its height along the normal [m].
+        surface: the solid, in its own frame.
+        carrier: where that frame is; None: the world's.
         normal_force: Eq. 8.
         friction: the tangential law, or None for a frictionless contact.
+        grip: what the law is multiplied by, `[npoint]`: the μ of every candidate for a law whose own is 1; None: 1.
+        restitution: how much of the speed of an impact comes back; None: nothing.
         names: the collider that each candidate belongs to.
     """
 
@@ -86,21 +83,25 @@ class Contact:
     position: Tensor
     radius: Tensor
     margin: Tensor
-    normal: Tensor
-    offset: Tensor
+    surface: Surface
+    carrier: Carrier | None
     normal_force: NormalForce
     friction: FrictionLaw | None
+    grip: Tensor | None = None
+    restitution: Restitution | None = None
     names: tuple[str, ...] = ()
 
     @staticmethod
     def between(
         articulation: Articulation,
         colliders: Sequence[Collider],
-        obstacle: HalfSpace,
-        normal_force: NormalForce,
-        friction: FrictionLaw | None,
+        obstacle: HalfSpace | Obstacle,
+        normal_force: NormalForce | None = None,
+        friction: FrictionLaw | None = None,
+        restitution: Restitution | None = None,
     ) -> Contact:
-        """All candidates of the colliders against the obstacle. Raises `InputError` for an unknown link or no candidate at all."""
+        """All candidates of the colliders against the obstacle. Without a normal force C⊥ is that of `default_stiffness`. Raises
+        `InputError` for an unknown link or no candidate at all."""
         links: list[int] = []
         centers, radii, margins = [], [], []
         names: list[str] = []
@@ -123,10 +124,11 @@ class Contact:
             position=tensor(np.concatenate(centers)),
             radius=tensor(np.concatenate(radii)),
             margin=tensor(np.concatenate(margins)),
-            normal=tensor(obstacle.normal),
-            offset=tensor(obstacle.offset),
-            normal_force=normal_force,
+            surface=obstacle.surface(articulation.dtype, articulation.device),
+            carrier=obstacle.carrier(articulation.dtype, articulation.device),
+            normal_force=default_stiffness(articulation) if normal_force is None else normal_force,
             friction=friction,
+            restitution=restitution,
             names=tuple(names),
         )
 
@@ -136,8 +138,7 @@ class Contact:
         try:
             shape = self.normal_force.force(zero)[0].shape
             if self.friction is not None:
-                force, _, _ = self.friction.force(zero, zero, zero, zero[..., None].expand(-1, -1, 3), torch.ones_like(zero))
-                shape = torch.broadcast_shapes(shape, force.shape[:-1])
+                shape = torch.broadcast_shapes(shape, self.friction.drag(zero, zero, zero, torch.ones_like(zero)).shape)
         except RuntimeError as error:
             raise InputError(
                 f"a parameter of the normal force or the friction does not fit the {count} candidates: must be one number or end "
@@ -154,150 +155,158 @@ class Contact:
         """Whether any candidate has a radius, so that rolling matters."""
         return bool((self.radius > 0).any())
 
+    @cached_property
+    def _grouping(self) -> Grouping:
+        return Grouping(self.link)
+
     def _centers(self, placement: Placement) -> Tensor:
-        return _mapped(placement.poses[..., self.link, :3, :], self.position)
+        return self._grouping.mapped(placement.poses, self.position)
 
     def prepare(self, step: StepContext) -> PreparedContact:
-        poses = step.previous.poses
-        links = torch.arange(poses.shape[-3], device=self.link.device)
-        on_link = (links[:, None] == self.link).to(self.radius.dtype)
-        return PreparedContact(step.dt[..., None], self._centers(step.previous), poses[..., :3, :3], on_link)
+        return self.recall(step, self.memory(()))
+
+    def memory(self, batch: tuple[int, ...]) -> Tensor:
+        """What the anchors are behind by in the solid's frame at a fresh start, `[*batch, npoint, 3]`; without anchors nothing,
+        `[*batch, 0, 3]`."""
+        count = len(self.radius) if isinstance(self.friction, AnchoredFriction) else 0
+        return self.position.new_zeros((*batch, count, 3))
+
+    def recall(self, step: StepContext, memory: Tensor) -> PreparedContact:
+        """`prepare` with what the anchors were behind by at the end of the last step."""
+        dt = step.dt[..., None]
+        centers, rotations = self._centers(step.previous), step.previous.poses[..., :3, :3]
+        frame = None
+        if self.carrier is not None:
+            before, after = (self.carrier.pose(time) for time in (step.time, step.time + step.dt))
+            frame = after[..., None, :3, :]
+            if self.carrier.motion.moves:
+                turn = after[..., :3, :3] @ before[..., :3, :3].mT
+                shift = after[..., :3, 3] - (turn @ before[..., :3, 3:]).squeeze(-1)
+                centers = mapped(torch.cat((turn, shift[..., None]), -1)[..., None, :, :], centers)
+                rotations = turn[..., None, :, :] @ rotations
+            centers = centers + dt[..., None] * (frame[..., :3] @ self.carrier.belt[:, None]).squeeze(-1)
+        anchor = None
+        if isinstance(self.friction, AnchoredFriction):
+            anchor = memory if frame is None else turned(frame[..., :3], memory)
+        prepared = PreparedContact(dt, centers, rotations, frame, anchor, None)
+        if self.restitution is None:
+            return prepared
+        free = self._grouping.mapped(step.target_poses, self.position)
+        coasting = self._centers(place(step.previous.articulation, step.target_q))
+        gaps = [-self._at(prepared, points, None).depth for points in (centers, free, coasting)]
+        return dataclasses.replace(prepared, bounce=self.restitution.bounce(gaps[0], gaps[1], dt, gaps[2]))
+
+    def remembered(self, prepared: PreparedContact, placement: Placement) -> Tensor:
+        """What the anchors are behind by after a step that ended at a placement; shapes as in `memory`."""
+        if not isinstance(self.friction, AnchoredFriction):
+            return prepared.centers[..., :0, :]
+        at = self.touching(prepared, placement)
+        kept = self.friction.kept(at.slip, at.depth)
+        return kept if prepared.frame is None else turned(prepared.frame[..., :3].mT, kept)
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact with the values of some worlds."""
         return replaced(
             self,
             position=worlds.pick(self.position, 2),
-            normal=worlds.pick(self.normal, 1),
-            offset=worlds.pick(self.offset, 0),
+            surface=self.surface.take(worlds),
+            carrier=None if self.carrier is None else self.carrier.take(worlds),
             normal_force=self.normal_force.take(worlds),
             friction=None if self.friction is None else self.friction.take(worlds),
         )
 
-    def _depth(self, centers: Tensor) -> Tensor:
-        return self.radius + self.margin + self.offset[..., None] - (centers @ self.normal[..., None]).squeeze(-1)
-
-    def _turn(self, prepared: PreparedContact, placement: Placement) -> Tensor:
-        """Rotation of each link over the step as a vector, `[*batch, nlink, 3]`."""
-        return rotation_log(placement.poses[..., :3, :3] @ prepared.rotations.mT)
-
-    def depth(self, placement: Placement) -> Tensor:
-        """Penetration depth of every candidate [m] `[*batch, npoint]`, < 0 where apart."""
-        return self._depth(self._centers(placement))
-
-    def _slip(self, prepared: PreparedContact, placement: Placement, centers: Tensor) -> Tensor:
-        normal = self.normal[..., None, :]
+    def _at(self, prepared: PreparedContact, centers: Tensor, turn: Tensor | None) -> Touching:
+        frame = prepared.frame
+        here = centers if frame is None else turned(frame[..., :3].mT, centers - frame[..., 3])
+        field = self.surface.field(here)
+        normal, bend = field.direction, None if field.flat else lambda: field.bend
+        if frame is not None:
+            normal = turned(frame[..., :3], normal)
+            bend = None if field.flat else lambda: frame[..., :3] @ field.bend @ frame[..., :3].mT
+        depth = self.radius + self.margin - field.distance
+        if prepared.bounce is not None:
+            depth = depth + prepared.bounce
         moved = centers - prepared.centers
+        if prepared.anchor is not None:
+            moved = moved + prepared.anchor
+        return Touching(centers, normal, depth, moved, self.radius if self.rounded else None, turn, bend, field.steepness)
+
+    def touching(self, prepared: PreparedContact, placement: Placement) -> Touching:
+        """Where the candidates are at a placement that ends the prepared step."""
+        turn = None
         if self.rounded:
-            turn = self._turn(prepared, placement)[..., self.link, :]
-            moved = moved - self.radius[..., None] * torch.linalg.cross(turn, normal.expand_as(turn))
-        return moved - (moved * normal).sum(-1, keepdim=True) * normal
+            turn = self._grouping.picked(rotation_log(placement.poses[..., :3, :3] @ prepared.rotations.mT))
+        return self._at(prepared, self._centers(placement), turn)
 
-    def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
-        centers = self._centers(placement)
-        normal = self.normal[..., None, :].expand_as(centers)
-        depth = self._depth(centers)
-        push, push_slope = self.normal_force.force(depth)
-        force = push[..., None] * normal
-        by_depth = push_slope[..., None] * normal
-        by_slip = None
-        if self.friction is not None:
-            slip = self._slip(prepared, placement, centers)
-            drag, drag_by_depth, by_slip = self.friction.force(push, push_slope, depth, slip, prepared.dt)
-            force = force + drag
-            by_depth = by_depth + drag_by_depth
-        points = centers - self.radius[..., None] * normal if self.rounded else centers
-        on_link = prepared.on_link.expand(*force.shape[:-2], *prepared.on_link.shape)
+    def force(self, prepared: PreparedContact, placement: Placement) -> ContactForce:
+        """The forces on the candidates at a placement that ends the prepared step."""
+        law = self.normal_force
+        if self.restitution is not None and prepared.bounce is not None:
+            law = self.restitution.stiffened(law, prepared.bounce)
+        return ContactForce(self.touching(prepared, placement), law, self.friction, prepared.dt, self.grip)
 
-        def summed(blocks: Tensor) -> Tensor:
-            return (on_link @ blocks.flatten(-2)).unflatten(-1, blocks.shape[-2:])
+    def load(self, prepared: PreparedContact, placement: Placement) -> ForetellingLoad:
+        contact = self.force(prepared, placement)
+        links, grouping = placement.poses.shape[-3], self._grouping
+        at = contact.at
+        flat = at.bend is None and not self.rounded
+        ends = extended(grouping.rows(at.points))
 
         def stiffness() -> Tensor:
-            # minus the derivative of the force by the link's twist, in its ω and v columns, each [*batch, npoint, 3, 3]
-            turned, shifted = _outer(by_depth, torch.linalg.cross(centers, normal)), _outer(by_depth, normal)
-            if by_slip is not None:
-                tangential = by_slip - _outer((by_slip @ normal[..., None]).squeeze(-1), normal)
-                arm = skew(centers)
-                if self.rounded:
-                    turning = skew(self.normal)[..., None, :, :] @ log_jacobian_left(self._turn(prepared, placement))
-                    arm = arm - self.radius[..., None, None] * turning[..., self.link, :, :]
-                turned, shifted = turned + tangential @ arm, shifted - tangential
-            lever = skew(points)
-            twisted = lever @ turned
-            if self.rounded:  # the point of application moves with the centre, not with the surface
-                pull = self.radius[..., None, None] * _outer(normal, force)
-                trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-                twisted = twisted - pull + trace * torch.eye(3, dtype=pull.dtype, device=pull.device)
-            upper = torch.cat((summed(twisted), summed(lever @ shifted)), -1)
-            return torch.cat((upper, torch.cat((summed(turned), summed(shifted)), -1)), -2)
+            if not flat:
+                return grouping.spread(grouping.sums(contact.stiffness().flatten(-2)).unflatten(-1, (6, 6)), links)
+            summed = torch.zeros_like(ends[..., :1, :1])
+            for pair in contact.factors():
+                summed = summed + grouping.products(*(arm(ends[..., :3], grouping.rows(x)) for x in pair))
+            if contact.drag is not None:
+                summed = summed + inertia_stiffness(grouping.products(grouping.rows(contact.drag[..., None]) * ends, ends))
+            return grouping.spread(summed, links)
 
-        return LinkLoad(-torch.cat((summed(_outer(force, points)), (on_link @ force)[..., None]), -1), stiffness)
+        moment = -grouping.products(grouping.rows(contact.force), ends)
+        return ForetellingLoad(grouping.spread(moment, links), stiffness, functools.partial(self._outlook, contact))
 
-    def outlook(self, prepared: PreparedContact, motion: Motion) -> Callable[[Tensor], Tensor]:
-        """Each point of application moves on a parabola, so its depth d and the square of its slip u are polynomials in a; the work
-        is N ḋ + g u·u̇, where friction is −g u."""
-        at = motion.placement
-        centers, normal = self._centers(at), self.normal[..., None, :]
-        velocity = _mapped(motion.velocities[..., self.link, :, :], centers)
-        acceleration = _mapped(motion.changes[..., self.link, :, :], centers)
+    def _outlook(self, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
+        velocity = self._grouping.mapped(motion.rates, self.position)
+        acceleration = self._grouping.mapped(motion.accelerations, self.position)
         if self.rounded:  # as in the slip: the surface moves by −ρ φ × n beside its centre
-            arm = self.radius[..., None] * normal.expand_as(centers)
-            velocity = velocity - torch.linalg.cross(motion.twists[..., self.link, :3], arm)
-            acceleration = acceleration - torch.linalg.cross(motion.drifts[..., self.link, :3], arm)
-        depth, sinks, sinks_faster = self._depth(centers), -(velocity * normal).sum(-1), -(acceleration * normal).sum(-1)
-        law, dt = self.friction, prepared.dt
-        if law is not None:
-            slip = self._slip(prepared, at, centers)
-            first, second = velocity + sinks[..., None] * normal, acceleration + sinks_faster[..., None] * normal
-            size, along, square = (slip * slip).sum(-1), (slip * first).sum(-1), (first * first + slip * second).sum(-1)
-            cube, fourth = (first * second).sum(-1), (second * second).sum(-1)
+            out = self.radius[..., None] * contact.at.normal
+            velocity = velocity - cross(self._grouping.picked(motion.twists[..., :3]), out)
+            acceleration = acceleration - cross(self._grouping.picked(motion.drifts[..., :3]), out)
+        return contact_outlook(contact, velocity, acceleration)
 
-        def work(length: Tensor) -> Tensor:
-            a = length[..., None]
-            deep = depth + a * (sinks + 0.5 * a * sinks_faster)
-            push, _ = self.normal_force.force(deep)
-            power = push * (sinks + a * sinks_faster)
-            if law is not None:
-                far = size + a * (2 * along + a * (square + a * (cube + 0.25 * a * fourth)))
-                onward = along + a * (square + a * (1.5 * cube + 0.5 * a * fourth))
-                power = power + law.drag(push, deep, far.clamp_min(0).sqrt(), dt) * onward
-            return power.sum(-1)
+    def depth(self, placement: Placement, time: Tensor | None = None) -> Tensor:
+        """Penetration depth of every candidate [m] `[*batch, npoint]`, < 0 where apart, from the solid as it stands at `time`
+        `[*batch]` [s], or at the start."""
+        centers = self._centers(placement)
+        frame = None
+        if self.carrier is not None:
+            frame = self.carrier.pose(centers.new_zeros(()) if time is None else time)[..., None, :3, :]
+        none = centers.new_zeros(())
+        return self._at(PreparedContact(none, none, none, frame, None, None), centers, None).depth
 
-        return work
-
-    def potential(self, placement: Placement) -> Tensor:
+    def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
-        return self.normal_force.energy(self.depth(placement)).sum(-1)
+        return self.normal_force.energy(self.depth(placement, time)).sum(-1)
 
     def energy(self, prepared: PreparedContact, placement: Placement) -> Tensor:
         """Stored energy (Eq. 9) and, where the friction is lagged, its energy μ N̂ S(‖u‖) [J] `[*batch]`. Friction that follows
         the normal force is the gradient of no scalar: it has no part in this."""
-        centers = self._centers(placement)
-        energy = self.normal_force.energy(self._depth(centers))
-        if isinstance(self.friction, LaggedFriction):
-            energy = energy + self.friction.energy(self._slip(prepared, placement, centers), prepared.dt)
-        return energy.sum(-1)
+        return self.force(prepared, placement).energy().sum(-1)
 
     def lagged(self, prepared: PreparedContact, placement: Placement) -> Self:
         """The same contact with its friction held at the normal forces and depths of `placement`; without friction, or with a law
         that is no `SlipLaw`, the contact itself. What `softened` does later to C⊥ does not reach the held friction.
 
-        The load is then the gradient of `energy`, exactly for points. For rounded candidates it is not: friction f acts at c − ρn,
-        which moves by δc − ρ δω × n, while the slip takes φ and moves by δc − ρ (Lδω) × n, L = ∂φ/∂ω = 1 − ½[φ]× + …. The gradient
-        has the moment ρ (Lᵀ − 1)(n × f) more than the load, about ½ρ‖φ‖‖f‖ at most, and none where φ is along n × f (planar
-        rolling)."""
-        law = self.friction.law if isinstance(self.friction, LaggedFriction) else self.friction
-        if not isinstance(law, SlipLaw):
-            return self
-        depth = self.depth(placement)
-        normal, _ = self.normal_force.force(depth)
-        return replaced(self, friction=LaggedFriction(law, normal, depth))
+        The load is then the gradient of `energy`, exactly for points on flat solids. For rounded candidates it is not: friction f
+        acts at c − ρn, which moves by δc − ρ δω × n, while the slip takes φ and moves by δc − ρ (Lδω) × n with L = ∂φ/∂ω. The
+        gradient has the moment ρ (Lᵀ − 1)(n × f) more than the load, about ½ρ‖φ‖‖f‖ at most, and none where φ is along n × f
+        (planar rolling)."""
+        contact = self.force(prepared, placement)
+        return replaced(self, friction=lagged_law(self.friction, contact.push, contact.at.depth))
 
     def widened(self, factor: float) -> Self:
         """The same contact with its friction smooth over a `factor` ≥ 1 times wider range of slip speeds, where the law has one."""
-        if not isinstance(self.friction, SlipLaw | LaggedFriction):
-            return self
-        return replaced(self, friction=self.friction.widened(factor))
+        return replaced(self, friction=widened_law(self.friction, factor))
 
     def softened(self, factor: float) -> Contact:
         """The same contact with C⊥ scaled by `factor`; the friction law follows the normal force."""
@@ -305,22 +314,6 @@ class Contact:
 
     def points(self, prepared: PreparedContact, placement: Placement) -> ContactPoints:
         """The contacts at a placement that ends the prepared step."""
-        centers = self._centers(placement)
-        depth = self._depth(centers)
-        push, push_slope = self.normal_force.force(depth)
-        force = push[..., None] * self.normal[..., None, :]
-        slip = self._slip(prepared, placement, centers)
-        if self.friction is not None:
-            force = force + self.friction.force(push, push_slope, depth, slip, prepared.dt)[0]
-        point = centers - self.radius[..., None] * self.normal[..., None, :]
-        return ContactPoints(point, depth, self.normal, force, slip)
-
-
-def _mapped(matrices: Tensor, points: Tensor) -> Tensor:
-    """M (p, 1), `[*, 3, 4], [*, 3] → [*, 3]`."""
-    return (matrices[..., :3] @ points[..., None]).squeeze(-1) + matrices[..., 3]
-
-
-def _outer(a: Tensor, b: Tensor) -> Tensor:
-    """a bᵀ, `[*, 3], [*, 3] → [*, 3, 3]`."""
-    return a[..., :, None] * b[..., None, :]
+        contact = self.force(prepared, placement)
+        at = contact.at
+        return ContactPoints(at.points, at.depth, at.normal, contact.force, at.slip)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
-from pbfd_torch.terms.coulomb_friction import slip_factor, slip_work
+from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.worlds import Worlds, replaced
 
@@ -41,7 +41,8 @@ class JointDryFriction:
     def load(self, prepared: PreparedDryFriction, placement: Placement) -> JointLoad:
         moved = _moved(prepared, placement)
         size = moved.abs()
-        factor, slope = slip_factor(size, self.slip_speed * prepared.dt)
+        width = self.slip_speed * prepared.dt
+        factor, slope = slip_factor(size, width), slip_factor_slope(size, width)
         return diagonal_load(self.torque * factor * moved, self.torque * (factor + slope * size))
 
     def take(self, worlds: Worlds) -> Self:

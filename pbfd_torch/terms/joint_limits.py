@@ -41,7 +41,8 @@ class JointLimits:
 
     def energy(self, prepared: None, placement: Placement) -> Tensor:
         """The stored energy [J] `[*batch]`."""
-        return self.potential(placement)
+        below, above = _violations(placement)
+        return (self.stiffness * (above**3 + below**3)).sum(-1) / 3
 
     def take(self, worlds: Worlds) -> Self:
         """The same limits with the stiffness of some worlds."""
@@ -51,10 +52,9 @@ class JointLimits:
         """The same limits with stiffness scaled by `factor`."""
         return JointLimits(self.stiffness * factor)
 
-    def potential(self, placement: Placement) -> Tensor:
+    def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
-        below, above = _violations(placement)
-        return (self.stiffness * (above**3 + below**3)).sum(-1) / 3
+        return self.energy(None, placement)
 
 
 def _violations(placement: Placement) -> tuple[Tensor, Tensor]:

@@ -80,7 +80,7 @@ class JointSprings(_Pull):
         """The same springs with the values of some worlds."""
         return replaced(self, stiffness=worlds.pick(self.stiffness, 1), rest=worlds.pick(self.rest, 1))
 
-    def potential(self, placement: Placement) -> Tensor:
+    def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
         return self.energy(PreparedPull(self.stiffness, self.rest), placement)
 

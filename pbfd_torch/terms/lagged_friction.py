@@ -3,37 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Self, runtime_checkable
+from typing import Self
 
 import torch
 from torch import Tensor
 
+from pbfd_torch.terms.friction_law import FrictionLaw, SlipLaw
 from pbfd_torch.worlds import Worlds, replaced
-
-
-@runtime_checkable
-class SlipLaw(Protocol):
-    """A friction law whose force is the gradient of a scalar of the slip while the normal force and the depth are held still."""
-
-    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See `FrictionLaw`."""
-        ...
-
-    def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
-        """See `FrictionLaw`."""
-        ...
-
-    def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
-        """The scalar [J] `[*, n]` whose gradient by the slip is minus the force, 0 at zero slip."""
-        ...
-
-    def take(self, worlds: Worlds) -> Self:
-        """See `FrictionLaw`."""
-        ...
-
-    def widened(self, factor: float) -> Self:
-        """The same law, smooth over a `factor` ≥ 1 times wider range of slip speeds."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +21,16 @@ class LaggedFriction:
     normal: Tensor
     depth: Tensor
 
-    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Friction force and its derivatives by depth, which is zero, and by slip, shapes as in `CoulombFriction.force`."""
-        force, by_depth, by_slip = self.law.force(self.normal, normal_slope, self.depth, slip, dt)
-        return force, torch.zeros_like(by_depth), by_slip
-
     def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
         """The law's at the frozen normal force and depth."""
         return self.law.drag(self.normal, self.depth, size, dt)
 
-    def energy(self, slip: Tensor, dt: Tensor) -> Tensor:
+    def drag_slopes(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """See `FrictionLaw`; nothing depends on the present depth."""
+        _, by_size = self.law.drag_slopes(self.normal, normal_slope, self.depth, size, dt)
+        return torch.zeros_like(by_size), by_size
+
+    def energy(self, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """μ N̂ S(‖u‖) for Coulomb's law, S as in `slip_work`; C∥ (β + 1)/(e + 2) ‖u‖^{e+2} d̂^{γ+1} for the paper's: [J] `[*, n]`."""
         return self.law.slip_energy(self.normal, self.depth, slip, dt)
 
@@ -65,3 +41,14 @@ class LaggedFriction:
     def widened(self, factor: float) -> Self:
         """The same frozen friction, smooth over a `factor` ≥ 1 times wider range of slip speeds."""
         return replaced(self, law=self.law.widened(factor))
+
+
+def lagged_law(law: FrictionLaw | None, normal: Tensor, depth: Tensor) -> FrictionLaw | None:
+    """The law held at normal forces and depths `[*batch, npoint]` where it is a `SlipLaw` or held already; else the law itself."""
+    inner = law.law if isinstance(law, LaggedFriction) else law
+    return LaggedFriction(inner, normal, depth) if isinstance(inner, SlipLaw) else law
+
+
+def widened_law(law: FrictionLaw | None, factor: float) -> FrictionLaw | None:
+    """The law smooth over a `factor` ≥ 1 times wider range of slip speeds, where it has one; else the law."""
+    return law.widened(factor) if isinstance(law, SlipLaw | LaggedFriction) else law

@@ -25,6 +25,7 @@ class StepContext:
         target_poses: T̂ `[*batch, nlink, 4, 4]`, gravity folded in: inertia pulls the link poses there.
         target_q: q̂ `[*batch, nq]`: where inertia pulls the joints' own rotors (armature).
         control: `[*batch, nu]` or None.
+        time: [s] at the start, like dt.
     """
 
     dt: Tensor
@@ -33,6 +34,7 @@ class StepContext:
     target_poses: Tensor
     target_q: Tensor
     control: Tensor | None
+    time: Tensor
 
     def take(self, worlds: Worlds) -> StepContext:
         """The step of some worlds."""
@@ -44,22 +46,46 @@ class StepContext:
             target_poses=worlds.pick(self.target_poses, 3),
             target_q=worlds.pick(self.target_q, 1),
             control=None if self.control is None else worlds.pick(self.control, 1),
+            time=worlds.pick(self.time, 0),
         )
 
 
 class LinkLoad:
     """Loads on links, in world coordinates about the world origin. The stiffness is computed when first asked for.
 
-    moment: `[*batch, nlink, 3, 4]` [G | g] of METHOD §3: minus the first moment Σ f p̄ᵀ of the forces [N m | N]."""
+    moment: `[*batch, nlink, 3, 4]` [G | g] of METHOD §3: minus the first moment Σ f p̄ᵀ of the forces [N m | N]. coupled: whether
+    the wrench on one link answers the twist of another."""
 
-    def __init__(self, moment: Tensor, stiffness: Callable[[], Tensor]) -> None:
+    def __init__(self, moment: Tensor, stiffness: Callable[[], Tensor], coupling: Callable[[], Tensor] | None = None) -> None:
         self.moment = moment
+        self.coupled = coupling is not None
         self._stiffness = stiffness
+        self._coupling = coupling
 
     @cached_property
     def stiffness(self) -> Tensor:
         """A `[*batch, nlink, 6, 6]`: how the wrench (torque, force) answers a twist (ω, v) of the link, axes held still."""
         return self._stiffness()
+
+    @cached_property
+    def coupling(self) -> Tensor:
+        """`[*batch, nlink, nlink, 6, 6]`: how the wrench on the first link answers a twist of the second, another one; zero unless
+        `coupled`."""
+        if self._coupling is None:
+            links = self.moment.shape[-3]
+            return self.moment.new_zeros((*self.moment.shape[:-2], links, 6, 6))
+        return self._coupling()
+
+
+class ForetellingLoad(LinkLoad):
+    """The load of a term that foretells, with what that needs already at hand. outlook: as in `Foretelling`, of a motion from the
+    load's placement."""
+
+    def __init__(
+        self, moment: Tensor, stiffness: Callable[[], Tensor], outlook: Callable[[Motion], Callable[[Tensor], Tensor]]
+    ) -> None:
+        super().__init__(moment, stiffness)
+        self.outlook = outlook
 
 
 class JointLoad:
@@ -97,7 +123,8 @@ class Term(Protocol):
 
 @runtime_checkable
 class Foretelling(Protocol):
-    """A term on links whose forces set in or change abruptly, and that can tell where along a direction they do."""
+    """A term on links whose forces set in or change abruptly, and that can tell where along a direction they do; if its load cannot
+    (`ForetellingLoad`)."""
 
     def outlook(self, prepared: Any, motion: Motion) -> Callable[[Tensor], Tensor]:
         """The work r·d [J] of its forces, d the motion's velocity, where links have moved to second order in the length a:
@@ -115,11 +142,50 @@ class OneSided(Protocol):
 
 
 @runtime_checkable
+class Remembering(Protocol):
+    """A term that carries something from step to step; it is part of the state."""
+
+    def memory(self, batch: tuple[int, ...]) -> Tensor:
+        """What it remembers at a fresh start, `[*batch, ...]`."""
+        ...
+
+    def recall(self, step: StepContext, memory: Tensor) -> Any:
+        """`prepare`, knowing what was remembered at the end of the last step."""
+        ...
+
+    def remembered(self, prepared: Any, placement: Placement) -> Tensor:
+        """What it remembers after a step that ended at a placement."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Aftermath:
+    """What a step leaves behind besides where it ended.
+
+    Attributes:
+        memory: of the terms that remember something, each `[*batch, ...]`.
+        hazards: `[*batch]` int, `Hazard` bits.
+    """
+
+    memory: tuple[Tensor, ...]
+    hazards: Tensor
+
+
+@runtime_checkable
+class Hazardous(Protocol):
+    """A term that can tell when it may have missed something."""
+
+    def hazards(self, prepared: Any, placement: Placement) -> Tensor:
+        """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
+        ...
+
+
+@runtime_checkable
 class Conservative(Protocol):
     """A term that stores energy."""
 
-    def potential(self, placement: Placement) -> Tensor:
-        """Stored energy [J] `[*batch]`."""
+    def potential(self, placement: Placement, time: Tensor) -> Tensor:
+        """Stored energy [J] `[*batch]` at a time [s]."""
         ...
 
 

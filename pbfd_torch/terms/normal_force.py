@@ -9,6 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.worlds import Worlds, replaced
@@ -18,8 +19,10 @@ def power(base: Tensor, exponent: float) -> Tensor:
     """base ** exponent for base ≥ 0 and exponent ≥ 0; whole exponents by products, so that a batch and a single world round
     alike."""
     if exponent == int(exponent) and exponent <= 4:
-        result = torch.ones_like(base)
-        for _ in range(int(exponent)):
+        if exponent == 0:
+            return torch.ones_like(base)
+        result = base
+        for _ in range(int(exponent) - 1):
             result = result * base
         return result
     positive = base > 0
@@ -43,7 +46,7 @@ class NormalForce:
             raise InputError(f"exponent α is {self.exponent}: must be > 1 and finite, or the residual is not smooth")
 
     @staticmethod
-    def for_weight(weight: float, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:
+    def for_weight(weight: float | Tensor, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:
         """The stiffness at which a load `weight` [N] on one point rests `penetration` [m] deep."""
         require_positive("weight", weight, "N")
         require_positive("penetration", penetration, "m")
@@ -59,9 +62,23 @@ class NormalForce:
 
     def force(self, depth: Tensor) -> tuple[Tensor, Tensor]:
         """N and dN/dd `[*batch, npoint]` at depth d (≤ 0: apart, no force)."""
-        d = depth.clamp_min(0)
-        return self.stiffness * power(d, self.exponent), self.stiffness * self.exponent * power(d, self.exponent - 1)
+        return self.push(depth), self.slope(depth)
+
+    def push(self, depth: Tensor) -> Tensor:
+        """N alone."""
+        return self.stiffness * power(depth.clamp_min(0), self.exponent)
+
+    def slope(self, depth: Tensor) -> Tensor:
+        """dN/dd alone."""
+        return self.stiffness * self.exponent * power(depth.clamp_min(0), self.exponent - 1)
 
     def energy(self, depth: Tensor) -> Tensor:
         """C⊥ d^{α+1}/(α+1) [J] per candidate."""
         return self.stiffness * power(depth.clamp_min(0), self.exponent + 1) / (self.exponent + 1)
+
+
+def default_stiffness(articulation: Articulation, penetration: float = 1e-3) -> NormalForce:
+    """The normal force at which the whole articulation, on one point and under 9.81 m/s², rests `penetration` [m] deep: nothing to
+    tune. C⊥ is `[*batch, 1]` where the masses differ from world to world."""
+    weight = 9.81 * articulation.mass.sum(-1).detach()
+    return NormalForce.for_weight(float(weight) if weight.ndim == 0 else weight[..., None], penetration)

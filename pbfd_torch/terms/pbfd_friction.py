@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
-import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.terms.checks import require_non_negative, require_widening
-from pbfd_torch.terms.coulomb_friction import isotropic_slope, slip_size
+from pbfd_torch.terms.friction_law import per_size, slip_size
 from pbfd_torch.terms.normal_force import power
 from pbfd_torch.worlds import Worlds, replaced
 
@@ -49,9 +48,10 @@ class PbfdFriction:
             raise InputError(f"β is {beta}: the derived law needs β ≥ 1 to stay finite at zero slip")
         return PbfdFriction(stiffness, beta, gamma, beta - 1)
 
-    def calibrated(self, mu: float | Tensor, normal_stiffness: float | Tensor, speed: float, dt: float) -> PbfdFriction:
+    def calibrated(self, mu: float | Tensor, normal_stiffness: float | Tensor, speed: float | Tensor, dt: float) -> PbfdFriction:
         """The same law with the C∥ at which a contact sliding at `speed` [m/s] feels μ: with α = 2 and γ = 1 friction is
-        proportional to the normal force, μ = (β + 1) (C∥/C⊥) (v Δt)^{e + 1} (METHOD §4). It holds at this speed and Δt only."""
+        proportional to the normal force, μ = (β + 1) (C∥/C⊥) (v Δt)^{e + 1} (METHOD §4). It holds at this speed and Δt only.
+        `calibration.calibrated_pbfd` is for any α and γ."""
         share = (self.beta + 1) * (speed * dt) ** (self.slip_exponent + 1)
         return replace(self, stiffness=mu * normal_stiffness / share)
 
@@ -59,31 +59,23 @@ class PbfdFriction:
         """The same law with the C∥ of some worlds."""
         return replaced(self, stiffness=worlds.pick(self.stiffness, 1))
 
-    def force(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Friction force and its derivatives by depth and by slip, shapes as in `CoulombFriction.force`."""
-        d = depth.clamp_min(0)
-        size = slip_size(slip)
-        factor = power(size, self.slip_exponent)
-        if self.slip_exponent > 0:  # slope/‖u‖ · u uᵀ vanishes at u = 0, where isotropic_slope guards the division
-            safe = torch.where(size > 0, size, torch.ones_like(size))
-            slope = self.slip_exponent * factor / safe
-        else:
-            slope = torch.zeros_like(size)
-        scale = self.stiffness * (self.beta + 1)
-        weight = scale * power(d, self.gamma + 1)
-        weight_slope = scale * (self.gamma + 1) * power(d, self.gamma)
-        unit = factor[..., None] * slip
-        by_slip = -weight[..., None, None] * isotropic_slope(slip, size, factor, slope)
-        return -weight[..., None] * unit, -weight_slope[..., None] * unit, by_slip
+    def _weight(self, depth: Tensor, exponent: float) -> Tensor:
+        return self.stiffness * (self.beta + 1) * power(depth.clamp_min(0), exponent)
 
     def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
-        """C∥ (β + 1) ‖u‖^e d^{γ+1} `[*, n]`: the force is minus this times the slip."""
-        return self.stiffness * (self.beta + 1) * power(depth.clamp_min(0), self.gamma + 1) * power(size, self.slip_exponent)
+        """C∥ (β + 1) y^e d^{γ+1}."""
+        return self._weight(depth, self.gamma + 1) * power(size, self.slip_exponent)
+
+    def drag_slopes(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+        """See `FrictionLaw`."""
+        factor = power(size, self.slip_exponent)
+        by_depth = (self.gamma + 1) * self._weight(depth, self.gamma) * factor
+        return by_depth, self.slip_exponent * self._weight(depth, self.gamma + 1) * per_size(per_size(factor, size), size)
 
     def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """C∥ (β + 1)/(e + 2) ‖u‖^{e+2} d^{γ+1} [J] `[*, n]`: minus its gradient by the slip, with d held still, is the force. With
         e = β − 1 it is the density of Eq. 11 times C∥."""
-        weight = self.stiffness * (self.beta + 1) * power(depth.clamp_min(0), self.gamma + 1)
+        weight = self._weight(depth, self.gamma + 1)
         return weight * power(slip_size(slip), self.slip_exponent + 2) / (self.slip_exponent + 2)
 
     def widened(self, factor: float) -> Self:

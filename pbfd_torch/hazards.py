@@ -1,0 +1,20 @@
+"""What may be wrong with a step although its equations were solved, as bits per world."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Hazard(enum.IntFlag):
+    """Bits; 0: nothing."""
+
+    CANDIDATES_DROPPED = 1  # more was near than there are slots for: contacts may be missing
+    MOVED_TOO_FAR = 2  # a body moved further than detection looked: it may have jumped over something
+
+
+class Overflow(enum.Enum):
+    """What happens where more candidates are near than there are slots."""
+
+    FLAG = "flag"  # the nearest ones are kept, and the world is marked with `Hazard.CANDIDATES_DROPPED`
+    RAISE = "raise"  # `ContactOverflowError`
+    GROW = "grow"  # there are twice as many slots for that step, and again until all fit

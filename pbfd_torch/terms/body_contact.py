@@ -1,0 +1,307 @@
+"""Contact between bodies: links with links, and links with convex obstacles. Candidates are detected once at the start of a step.
+
+The wrench w = (p × f, f) of a candidate acts on its body, and −w on the body that carries the solid, at the same point p: momentum
+is kept. The force depends on how the two stand to each other, so it answers the relative twist W = V₁ − V₂ by A (`touching`), and
+turns with both of them. With what a constant force on a material point has (METHOD §3) left out, as everywhere:
+
+    K₁₁ = A,  K₁₂ = −A − D,  K₂₁ = M − A,  K₂₂ = A + D − M,   D V = (p × (ω × f), ω × f),  M V = ((v + ω × p) × f, 0).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.contact.candidates import Finder, Slots
+from pbfd_torch.contact.obstacle import Carrier
+from pbfd_torch.errors import ContactOverflowError
+from pbfd_torch.hazards import Hazard, Overflow
+from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.rotations import rotation_log, skew
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
+from pbfd_torch.terms.checks import require_non_negative, require_positive
+from pbfd_torch.terms.contact import ContactPoints
+from pbfd_torch.terms.contact_outlook import contact_outlook
+from pbfd_torch.terms.friction_law import FrictionLaw
+from pbfd_torch.terms.lagged_friction import lagged_law, widened_law
+from pbfd_torch.terms.load import LinkLoad, StepContext
+from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.restitution import Restitution
+from pbfd_torch.terms.touching import ContactForce, Touching, extended, mapped, outer
+from pbfd_torch.worlds import Worlds, replaced
+
+_FAR = 1e6  # [m] how far an empty slot is from everything
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedBodyContact:
+    dt: Tensor  # [*batch, 1]
+    slots: Slots
+    grip: Tensor  # [*batch, n] μ
+    bodies: Tensor  # [*batch, nbody, 4, 4] at the start
+    reach: Tensor  # [*batch, nbody] how far they may move without a candidate being missed
+    obstacles: Tensor  # [*batch, nobstacle, 4, 4] at the end
+    start: Tensor  # [*batch, n, 3] where the points were in the frames of the solids
+    turned: Tensor  # [*batch, n, 3, 3] how their bodies stood in the frames of the solids
+    anchor: Tensor | None  # [*batch, n, 3] what the anchors are behind by in the frames of the solids
+    bounce: Tensor | None = None  # [*batch, n] how far the surfaces are moved out to throw a point back
+
+
+@dataclass(frozen=True, eq=False)
+class BodyContact:
+    """Candidates between bodies, found anew in every step.
+
+    Attributes:
+        finder: what finds them.
+        obstacles: the bodies that are no links, numbered after these.
+        extent: `[nbody]` distance from a body's origin to its farthest collider point [m].
+        normal_force: Eq. 8.
+        friction: the tangential law for μ = 1, or None; `grip`: `[npair]` the μ of every pair of colliders.
+        restitution: how much of the speed of an impact comes back; None: nothing.
+        overflow: what to do where more is near than there are slots.
+        slack: [m] how much further than its free motion and half as far again a body may go without a candidate being missed.
+    """
+
+    finder: Finder
+    obstacles: tuple[Carrier, ...]
+    extent: Tensor
+    normal_force: NormalForce
+    friction: FrictionLaw | None
+    grip: Tensor
+    restitution: Restitution | None = None
+    slack: float = 0.01
+    overflow: Overflow = Overflow.FLAG
+
+    def __post_init__(self) -> None:
+        require_non_negative("μ of body contacts", self.grip)
+        require_positive("slack", self.slack, "m")
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same contact of some worlds."""
+        return replaced(
+            self,
+            finder=self.finder.take(worlds),
+            obstacles=tuple(x.take(worlds) for x in self.obstacles),
+            normal_force=self.normal_force.take(worlds),
+            friction=None if self.friction is None else self.friction.take(worlds),
+        )
+
+    def _standing(self, like: Tensor, time: Tensor) -> Tensor:
+        """Where the obstacles are, `[*batch, nobstacle, 4, 4]`, for as many worlds as link poses have."""
+        batch = like.shape[:-3]
+        poses = [x.pose(time).expand(*batch, 4, 4) for x in self.obstacles]
+        return torch.stack(poses, -3) if poses else like[..., :0, :, :]
+
+    def prepare(self, step: StepContext) -> PreparedBodyContact:
+        return self.recall(step, self.memory(step.target_q.shape[:-1]))
+
+    def memory(self, batch: tuple[int, ...]) -> Tensor:
+        """What the anchors know of each slot: what they are behind by, where its point is, and its pair (−1: none),
+        `[*batch, n, 7]`; without anchors nothing."""
+        count = self.finder.slots if isinstance(self.friction, AnchoredFriction) else 0
+        return self.extent.new_full((*batch, count, 7), -1.0)
+
+    def recall(self, step: StepContext, memory: Tensor) -> PreparedBodyContact:
+        """`prepare` with what the anchors were behind by at the end of the last step."""
+        with torch.no_grad():
+            links, target = step.previous.poses, step.target_poses
+            obstacles = self._standing(links, step.time + step.dt)
+            bodies = torch.cat((links, self._standing(links, step.time)), -3)
+            ahead = torch.cat((target.expand_as(links), obstacles), -3)
+            reach = 1.5 * self._travel(bodies, ahead) + self.slack
+            slots = self._found(bodies, reach)
+        first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
+        turn = second[..., :3].mT
+        start = (turn @ (mapped(first, slots.position) - second[..., 3])[..., None]).squeeze(-1)
+        start = start + step.dt[..., None, None] * self._running(slots, turn @ first[..., :3])
+        anchor = _inherited(memory, slots) if isinstance(self.friction, AnchoredFriction) else None
+        dt = step.dt[..., None]
+        bounce = None
+        if self.restitution is not None:
+            coasting = torch.cat((place(step.previous.articulation, step.target_q).poses, obstacles), -3)
+            bounce = self.restitution.bounce(_gaps(slots, bodies), _gaps(slots, ahead), dt, _gaps(slots, coasting))
+        grip = self.grip[slots.pair]
+        return PreparedBodyContact(dt, slots, grip, bodies, reach, obstacles, start, turn @ first[..., :3], anchor, bounce)
+
+    def _running(self, slots: Slots, turned: Tensor) -> Tensor:
+        """Velocity of belts at the slots as their solids see it, `[*batch, n, 3]`: the solids' less the points'."""
+        if not self.obstacles:
+            return torch.zeros_like(slots.position)
+        still = self.extent.new_zeros((len(self.extent) - len(self.obstacles), 3))
+        belt = torch.cat((still, torch.stack([x.belt for x in self.obstacles])))
+        return belt[slots.second] - (turned @ belt[slots.first][..., None]).squeeze(-1)
+
+    def _found(self, bodies: Tensor, reach: Tensor) -> Slots:
+        finder = self.finder
+        slots = finder.find(bodies, reach)
+        if self.overflow is Overflow.FLAG:
+            return slots
+        while bool(slots.dropped.any()):
+            if self.overflow is Overflow.RAISE:
+                raise ContactOverflowError(
+                    f"more contacts are near than the {finder.slots} slots hold in {int(slots.dropped.sum())} worlds: "
+                    "give more slots, or choose Overflow.FLAG or Overflow.GROW"
+                )
+            finder = finder.grown()
+            slots = finder.find(bodies, reach)
+        return slots
+
+    def _travel(self, before: Tensor, after: Tensor) -> Tensor:
+        """How far the farthest collider point of each body moves at most [m], `[*batch, nbody]`."""
+        shift = torch.linalg.vector_norm((after - before)[..., :3, 3], dim=-1)
+        turn = torch.linalg.matrix_norm((after - before)[..., :3, :3]) / 2**0.5  # the chord of a unit arm
+        return shift + self.extent * turn
+
+    def hazards(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
+        """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
+        after = torch.cat((placement.poses, prepared.obstacles), -3)
+        far = (self._travel(prepared.bodies, after) > prepared.reach).any(-1)
+        bits = prepared.slots.dropped.to(torch.int32) * int(Hazard.CANDIDATES_DROPPED)
+        return bits + far.to(torch.int32) * int(Hazard.MOVED_TOO_FAR)
+
+    def remembered(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
+        """What the anchors know after a step that ended at a placement; see `memory`."""
+        slots = prepared.slots
+        if not isinstance(self.friction, AnchoredFriction):
+            return prepared.start.new_zeros((*prepared.start.shape[:-2], 0, 7))
+        at, frame = self._touching(prepared, placement)
+        kept = (frame[..., :3].mT @ self.friction.kept(at.slip, at.depth)[..., None]).squeeze(-1)
+        pair = torch.where(slots.filled & (at.depth > 0), slots.pair, -1).to(kept.dtype)
+        return torch.cat((kept, slots.position, pair[..., None]), -1)[..., : self.finder.slots, :]
+
+    def _touching(self, prepared: PreparedBodyContact, placement: Placement) -> tuple[Touching, Tensor]:
+        """Where the candidates are at a placement, and the frames of the solids `[*batch, n, 3, 4]`."""
+        slots = prepared.slots
+        obstacles = prepared.obstacles.expand(*placement.poses.shape[:-3], *prepared.obstacles.shape[-3:])
+        bodies = torch.cat((placement.poses, obstacles), -3)
+        first, frame = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
+        centers, turn = mapped(first, slots.position), frame[..., :3]
+        field = slots.surface.field((turn.mT @ (centers - frame[..., 3])[..., None]).squeeze(-1))
+        start = prepared.start if prepared.anchor is None else prepared.start - prepared.anchor
+        depth = slots.radius - field.distance
+        if prepared.bounce is not None:
+            depth = depth + prepared.bounce
+        rolled = rotation_log(first[..., :3] @ (turn @ prepared.turned).mT)
+        return (
+            Touching(
+                centers=centers,
+                normal=(turn @ field.direction[..., None]).squeeze(-1),
+                depth=torch.where(slots.filled, depth, -_FAR),
+                moved=centers - mapped(frame, start),
+                radius=slots.radius,
+                turn=rolled,
+                bend=None if field.flat else lambda: turn @ field.bend @ turn.mT,
+                steepness=field.steepness,
+            ),
+            frame,
+        )
+
+    def force(self, prepared: PreparedBodyContact, placement: Placement) -> ContactForce:
+        """The forces on the first bodies at a placement that ends the prepared step."""
+        at, _ = self._touching(prepared, placement)
+        law = self.normal_force
+        if self.restitution is not None and prepared.bounce is not None:
+            law = self.restitution.stiffened(law, prepared.bounce)
+        return ContactForce(at, law, self.friction, prepared.dt, prepared.grip)
+
+    def load(self, prepared: PreparedBodyContact, placement: Placement) -> LinkLoad:
+        slots, contact = prepared.slots, self.force(prepared, placement)
+        links = placement.poses.shape[-3]
+        index = torch.arange(links, device=slots.first.device)[:, None]
+        on_first, on_second = ((index == x[..., None, :]).to(contact.force.dtype) for x in (slots.first, slots.second))
+
+        def summed(on: Tensor, blocks: Tensor) -> Tensor:
+            return (on @ blocks.flatten(-2)).unflatten(-1, blocks.shape[-2:])
+
+        @functools.cache
+        def blocks() -> tuple[Tensor, Tensor, Tensor]:
+            return contact.stiffness(), *_turning(contact)
+
+        def stiffness() -> Tensor:
+            answer, turned, moved = blocks()
+            return summed(on_first, answer) + summed(on_second, answer + turned - moved)
+
+        def coupling() -> Tensor:
+            answer, turned, moved = blocks()
+            there = (on_first[..., :, None, :] * on_second[..., None, :, :]).flatten(-3, -2)
+            back = (on_second[..., :, None, :] * on_first[..., None, :, :]).flatten(-3, -2)
+            return (summed(back, moved - answer) - summed(there, answer + turned)).unflatten(-3, (links, links))
+
+        moment = summed(on_second - on_first, outer(contact.force, extended(contact.at.points)))
+        return LinkLoad(moment, stiffness, coupling)
+
+    def outlook(self, prepared: PreparedBodyContact, motion: Motion) -> Callable[[Tensor], Tensor]:
+        """See `contact_outlook`; the motion is that of the first body as the second one sees it."""
+        slots, contact = prepared.slots, self.force(prepared, motion.placement)
+        at = contact.at
+        still = torch.zeros_like(prepared.obstacles[..., :3, :]).expand(*at.depth.shape[:-1], -1, -1, -1)
+
+        def of_slots(of_links: Tensor, body: Tensor) -> Tensor:
+            return _of_slots(torch.cat((of_links, still), -3), body)
+
+        first, second = ([of_slots(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
+        velocity = mapped(first[0] - second[0], at.centers)
+        carried = 2 * (second[0][..., :3] @ velocity[..., None]).squeeze(-1)  # Coriolis: seen from a turning body
+        acceleration = mapped(first[1] - second[1], at.centers) - carried
+        out = slots.radius[..., None] * at.normal
+        spin = first[0][..., :3] - second[0][..., :3]
+        return contact_outlook(contact, velocity - (spin @ out[..., None]).squeeze(-1), acceleration)
+
+    def energy(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
+        """As `Contact.energy`."""
+        return self.force(prepared, placement).energy().sum(-1)
+
+    def lagged(self, prepared: PreparedBodyContact, placement: Placement) -> Self:
+        """As `Contact.lagged`."""
+        contact = self.force(prepared, placement)
+        return replaced(self, friction=lagged_law(self.friction, contact.push, contact.at.depth))
+
+    def widened(self, factor: float) -> Self:
+        """As `Contact.widened`."""
+        return replaced(self, friction=widened_law(self.friction, factor))
+
+    def softened(self, factor: float) -> BodyContact:
+        """As `Contact.softened`."""
+        return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))
+
+    def points(self, prepared: PreparedBodyContact, placement: Placement) -> ContactPoints:
+        """The contacts at a placement that ends the prepared step; forces are on the first bodies."""
+        contact = self.force(prepared, placement)
+        at = contact.at
+        return ContactPoints(at.points, at.depth, at.normal, contact.force, at.slip)
+
+
+def _of_slots(bodies: Tensor, index: Tensor) -> Tensor:
+    """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`."""
+    return bodies[..., :3, :].take_along_dim(index[..., None, None].expand(*index.shape, 3, 4), -3)
+
+
+def _gaps(slots: Slots, bodies: Tensor) -> Tensor:
+    """How far the points are from the solids [m] `[*batch, n]`."""
+    first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
+    seen = (second[..., :3].mT @ (mapped(first, slots.position) - second[..., 3])[..., None]).squeeze(-1)
+    return slots.surface.field(seen).distance - slots.radius
+
+
+def _turning(contact: ContactForce) -> tuple[Tensor, Tensor]:
+    """D and M of the module's head, `[*, n, 6, 6]`."""
+    force, arm = skew(contact.force), skew(contact.at.points)
+    zero = torch.zeros_like(force)
+    turned = torch.cat((torch.cat((-arm @ force, zero), -1), torch.cat((-force, zero), -1)), -2)
+    moved = torch.cat((torch.cat((force @ arm, -force), -1), torch.cat((zero, zero), -1)), -2)
+    return turned, moved
+
+
+def _inherited(memory: Tensor, slots: Slots) -> Tensor:
+    """What the anchor of each slot is behind by: that of the nearest slot of the same pair in the step before, `[*batch, n, 3]`."""
+    gone = (memory[..., None, :, 6] != slots.pair[..., None].to(memory.dtype)) | ~slots.filled[..., None]
+    distance = (slots.position[..., :, None, :] - memory[..., None, :, 3:6]).square().sum(-1)
+    least, index = torch.where(gone, torch.inf, distance).min(-1)
+    kept = memory[..., :3].take_along_dim(index[..., None].expand(*index.shape, 3), -2)
+    return torch.where(torch.isfinite(least)[..., None], kept, torch.zeros_like(kept))

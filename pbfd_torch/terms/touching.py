@@ -1,0 +1,267 @@
+"""The geometry and the forces of contact candidates at one placement, and how the forces answer a motion.
+
+A candidate is a centre c on a body, a radius ρ ≥ 0 and a margin δ ≥ 0, beside a solid with signed distance φ, whose gradient there has the direction n.
+Its depth is d = ρ + δ − φ(c), and its force acts at p = c − ρn. Over the step it slips by u = (1 − nnᵀ)m with
+m = c − c₀ − ρ ϕ × n + a (METHOD §4): c₀ is where the solid has carried the centre of the start, ϕ the rotation since then relative
+to the solid, and a what an anchor remembers. Everything is in world axes; what moves below is the body, relative to the solid.
+
+Vectors `[*, n, 3]` of many candidates are best laid out in memory coordinate by coordinate, as transposes of `[*, 3, n]`: torch is
+several times faster where neighbours in memory belong to neighbouring candidates. The functions at the end return such vectors. In
+sums the slip goes first and the normal last: torch lays a result out like its first operand, and planes have one normal for all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.rotations import log_jacobian_left, skew
+from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
+from pbfd_torch.terms.normal_force import NormalForce
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """Candidates beside their solids.
+
+    Attributes:
+        centers: c `[*, n, 3]`. normal: n `[*, n, 3]`. depth: d `[*, n]`.
+        moved: c − c₀ + a `[*, n, 3]`.
+        radius: ρ `[*, n]`, or None where all are points.
+        turn: ϕ `[*, n, 3]`, or None with the radius.
+        bend: gives ∂n/∂c `[*, n, 3, 3]` in world axes, or None where the solids are flat.
+        steepness: ‖∇φ‖ `[*, n]`, or None where it is 1.
+    """
+
+    centers: Tensor
+    normal: Tensor
+    depth: Tensor
+    moved: Tensor
+    radius: Tensor | None
+    turn: Tensor | None
+    bend: Callable[[], Tensor] | None
+    steepness: Tensor | None = None
+
+    def sinking(self, velocity: Tensor) -> Tensor:
+        """How fast the depth falls for centres that move like this, `[*, n, 3, k]` → `[*, n, k]`."""
+        speed = rows(self.normal, velocity)
+        return speed if self.steepness is None else self.steepness[..., None] * speed
+
+    @cached_property
+    def travel(self) -> Tensor:
+        """m `[*, n, 3]`."""
+        if self.radius is None or self.turn is None:
+            return self.moved
+        return self.moved - self.radius[..., None] * cross(self.turn, self.normal)
+
+    @cached_property
+    def slip(self) -> Tensor:
+        """u `[*, n, 3]` [m]."""
+        return torch.addcmul(self.travel, dot(self.travel, self.normal)[..., None], self.normal, value=-1)
+
+    @cached_property
+    def size(self) -> Tensor:
+        """‖u‖ `[*, n]` [m]."""
+        return slip_size(self.slip)
+
+    @property
+    def points(self) -> Tensor:
+        """p `[*, n, 3]`."""
+        return self.centers if self.radius is None else self.centers - self.radius[..., None] * self.normal
+
+    @cached_property
+    def slip_slope(self) -> Tensor:
+        """∂u/∂W by the twist W = (ω, v) of the body about the world origin, `[*, n, 3, 6]`."""
+        shift = shifting(self.centers)
+        move = shift
+        if self.radius is not None and self.turn is not None:
+            roll = self.radius[..., None, None] * (skew(self.normal) @ log_jacobian_left(self.turn))
+            move = torch.cat((shift[..., :3] + roll, shift[..., 3:]), -1)
+        if self.bend is None:
+            return move - outer(self.normal, rows(self.normal, move))
+        turned = self.bend() @ shift  # ∂n/∂W
+        if self.radius is not None and self.turn is not None:
+            move = move - self.radius[..., None, None] * (skew(self.turn) @ turned)
+        along = dot(self.normal, self.travel)[..., None, None]
+        return move - outer(self.normal, rows(self.normal, move) + rows(self.travel, turned)) - along * turned
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForce:
+    """The force f = N n − G u of every candidate: N the normal force with what friction adds to it, G the drag. `grip`: what the
+    law is multiplied by, `[*, n]`: the μ of every candidate for a law whose own is 1."""
+
+    at: Touching
+    normal_force: NormalForce
+    friction: FrictionLaw | None
+    dt: Tensor
+    grip: Tensor | None = None
+
+    @property
+    def _lifting(self) -> Lifting | None:
+        law: object = self.friction
+        return law if isinstance(law, Lifting) else None
+
+    @cached_property
+    def push(self) -> Tensor:
+        """The normal force of depth alone, `[*, n]` [N]."""
+        return self.normal_force.push(self.at.depth)
+
+    @cached_property
+    def _push_slope(self) -> Tensor:
+        return self.normal_force.slope(self.at.depth)
+
+    def _gripped(self, value: Tensor) -> Tensor:
+        return value if self.grip is None else self.grip * value
+
+    @cached_property
+    def normal(self) -> Tensor:
+        """N `[*, n]` [N]."""
+        if self._lifting is None:
+            return self.push
+        return self.push + self._gripped(self._lifting.lift(self.at.depth, self.at.size))
+
+    @cached_property
+    def drag(self) -> Tensor | None:
+        """G `[*, n]` [N/m], None without friction."""
+        if self.friction is None:
+            return None
+        return self._gripped(self.friction.drag(self.push, self.at.depth, self.at.size, self.dt))
+
+    @cached_property
+    def force(self) -> Tensor:
+        """f `[*, n, 3]` on the body [N]."""
+        if self.drag is None:
+            return self.normal[..., None] * self.at.normal
+        return torch.addcmul(-self.drag[..., None] * self.at.slip, self.normal[..., None], self.at.normal)
+
+    def energy(self) -> Tensor:
+        """Stored energy (Eq. 9) and the friction's, where it is a gradient, `[*, n]` [J]."""
+        energy = self.normal_force.energy(self.at.depth)
+        law: object = self.friction
+        if not isinstance(law, Storing):
+            return energy
+        return energy + self._gripped(law.energy(self.at.depth, self.at.slip, self.dt))
+
+    @cached_property
+    def _normal_slopes(self) -> tuple[Tensor, Tensor | None]:
+        """dN/dd and (∂N/∂y)/y, y = ‖u‖: each `[*, n]`, None where N does not depend on the slip."""
+        if self._lifting is None:
+            return self._push_slope, None
+        by_depth, by_size = (self._gripped(x) for x in self._lifting.lift_slopes(self.at.depth, self.at.size))
+        return self._push_slope + by_depth, by_size
+
+    @cached_property
+    def _drag_slopes(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """G, dG/dd, (∂G/∂y)/y: each `[*, n]`; None without friction."""
+        if self.friction is None or self.drag is None:
+            return None
+        slopes = self.friction.drag_slopes(self.push, self._push_slope, self.at.depth, self.at.size, self.dt)
+        by_depth, by_size = (self._gripped(x) for x in slopes)
+        return self.drag, by_depth, by_size
+
+    def answer(self) -> Tensor:
+        """−∂f/∂W `[*, n, 3, 6]`."""
+        at = self.at
+        by_depth, by_size = self._normal_slopes
+        shift = shifting(at.centers)
+        sinks = at.sinking(shift)  # −∂d/∂W
+        answer = outer(at.normal, by_depth[..., None] * sinks)
+        if at.bend is not None:
+            answer = answer - self.normal[..., None, None] * (at.bend() @ shift)
+        if self._drag_slopes is None:
+            return answer
+        drag, drag_by_depth, drag_by_size = self._drag_slopes
+        slips = at.slip_slope
+        grows = rows(at.slip, slips)  # y ∂y/∂W
+        if by_size is not None:
+            answer = answer - outer(at.normal, by_size[..., None] * grows)
+        resists = drag_by_size[..., None] * grows - drag_by_depth[..., None] * sinks
+        return answer + drag[..., None, None] * slips + outer(at.slip, resists)
+
+    def stiffness(self) -> Tensor:
+        """How the wrench of every candidate about the world origin answers W, `[*, n, 6, 6]`, the part left out that a constant
+        force on a material point at p has (`Balance.jacobian` adds it)."""
+        at, answer = self.at, self.answer()
+        torque = skew(at.points) @ answer
+        if at.radius is not None:  # the point of application moves with the centre, not with the surface
+            arm = at.radius[..., None, None]
+            pull = outer(at.normal, self.force)
+            trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+            eye = torch.eye(3, dtype=pull.dtype, device=pull.device)
+            torque = torque + torch.cat((arm * (trace * eye - pull), torch.zeros_like(pull)), -1)
+            if at.bend is not None:
+                torque = torque - arm * (skew(self.force) @ at.bend() @ shifting(at.centers))
+        return torch.cat((torque, answer), -2)
+
+    def factors(self) -> list[tuple[Tensor, Tensor]]:
+        """`stiffness` of points at flat solids as a sum of products of `arm(c, l)` and `arm(c, r)`: the pairs l, r `[*, n, 3]`. The
+        part G XᵀX with X = `shifting(c)` is left to the second moments of G."""
+        at = self.at
+        by_depth, by_size = self._normal_slopes
+        if self._drag_slopes is None:
+            return [(by_depth[..., None] * at.normal, at.normal)]
+        drag, drag_by_depth, drag_by_size = self._drag_slopes
+        first = torch.addcmul(-drag_by_depth[..., None] * at.slip, (by_depth - drag)[..., None], at.normal)
+        second = drag_by_size[..., None] * at.slip
+        if by_size is not None:
+            second = torch.addcmul(second, by_size[..., None], at.normal, value=-1)
+        return [(first, at.normal), (second, at.slip)]
+
+
+def arm(points: Tensor, forces: Tensor) -> Tensor:
+    """Wrench (p × f, f) about the world origin, `[*, 3], [*, 3] → [*, 6]`."""
+    return torch.stack((*_cross(points, forces), *forces.unbind(-1)), -2).mT
+
+
+def shifting(points: Tensor) -> Tensor:
+    """X = [−[p]× | 1], which takes a twist (ω, v) about the world origin to the velocity of a point, `[*, 3] → [*, 3, 6]`."""
+    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape, 3)
+    return torch.cat((-skew(points), eye), -1)
+
+
+def extended(points: Tensor) -> Tensor:
+    """p̄ = (p, 1), `[*, 3] → [*, 4]`."""
+    return torch.cat((points.mT, torch.ones_like(points.mT[..., :1, :])), -2).mT
+
+
+def turned(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """M v, `[*, n or 1, 3, 3], [*, n, 3] → [*, n, 3]`; not by a matrix product, which is slow for so small ones."""
+    first, second, third = matrices.movedim(-3, -1).unbind(-2)
+    x, y, z = vectors.mT.split(1, -2)
+    return torch.addcmul(torch.addcmul(first * x, second, y), third, z).mT
+
+
+def mapped(matrices: Tensor, points: Tensor) -> Tensor:
+    """M p̄, `[*, n or 1, 3, 4], [*, n, 3] → [*, n, 3]`."""
+    return turned(matrices[..., :3], points) + matrices[..., 3]
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """a · b, `[*, 3], [*, 3] → [*]`."""
+    return (a * b).sum(-1)
+
+
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """a × b, `[*, n, 3], [*, n, 3] → [*, n, 3]`."""
+    return torch.stack(_cross(a, b), -2).mT
+
+
+def _cross(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The coordinates of a × b, each `[*, n]`."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def outer(a: Tensor, b: Tensor) -> Tensor:
+    """a bᵀ, `[*, n], [*, m] → [*, n, m]`."""
+    return a[..., :, None] * b[..., None, :]
+
+
+def rows(vector: Tensor, matrix: Tensor) -> Tensor:
+    """vᵀM, `[*, n], [*, n, m] → [*, m]`; not by a matrix product, which rounds differently for one world and for many."""
+    return (vector[..., None] * matrix).sum(-2)

@@ -1,0 +1,111 @@
+"""Contact between bodies: exact Jacobians, action and reaction, who meets whom."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Shape, Sphere
+from pbfd_torch.kinematics import place
+from pbfd_torch.rotations import unskew
+from pbfd_torch.terms.body_contact import BodyContact
+from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.friction_law import FrictionLaw
+from pbfd_torch.terms.normal_force import NormalForce
+from tests.finite_differences import jacobian, relative_error
+from tests.random_trees import generator, moved_q
+from tests.states import state_of
+from tests.term_cases import Situation
+
+STICKING = CoulombFriction(1.0, slip_speed=50.0)
+SLIDING = CoulombFriction(1.0, slip_speed=1e-4)
+SHAPES: dict[str, tuple[Shape, Shape]] = {
+    "sphere, sphere": (Sphere(0.2), Sphere(0.15)),
+    "sphere, capsule": (Sphere(0.2), Capsule(0.15, 0.3)),
+    "capsules": (Capsule(0.15, 0.3), Capsule(0.2, 0.2)),
+    "sphere, box": (Sphere(0.2), Box((0.2, 0.3, 0.15))),
+    "boxes": (Box((0.2, 0.3, 0.15)), Box((0.25, 0.2, 0.2))),
+    "capsule, box": (Capsule(0.15, 0.3), Box((0.25, 0.2, 0.2))),
+    "cylinder, box": (Cylinder(0.2, 0.2), Box((0.25, 0.2, 0.2))),
+}
+
+
+def two_arms(shapes: tuple[Shape, Shape], batch: tuple[int, ...]) -> tuple[Situation, list[Collider]]:
+    """A free body, and a hinged arm whose second link it meets, in the middle of a step; different in every world."""
+    inertia = ((0.02, 0.0, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.04))
+    links = [
+        Link("base", joints=(Joint("swing", JointKind.HINGE, axis=(0.2, 1.0, 0.1)),), mass=1.0, inertia=inertia),
+        Link(
+            "arm", "base", (0.4, 0.1, 0.0), joints=(Joint("turn", JointKind.BALL),), mass=1.0, com=(0.1, 0.0, 0.0), inertia=inertia
+        ),
+        Link("free", joints=(Joint("float", JointKind.FREE),), mass=0.7, com=(0.0, 0.02, 0.01), inertia=inertia),
+    ]
+    articulation = Articulation.from_links(links)
+    random = generator(5)
+    q = articulation.rest.expand(*batch, -1).clone()
+    q = moved_q(articulation, q, 3, 0.3)
+    arm = place(articulation, q).poses[..., 1, :3, 3]
+    t = articulation.topology
+    out = torch.nn.functional.normalize(torch.randn(*batch, 3, dtype=torch.float64, generator=random), dim=-1)
+    q[..., t.free_q[0]] = arm + 0.3 * out
+    now = moved_q(articulation, q, 4, 0.01)
+    before = moved_q(articulation, now, 5, 0.01)
+    s = Situation(
+        articulation, state_of(now, before), q, torch.tensor(0.02, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), None
+    )
+    return s, [Collider("one", "arm", shapes[0]), Collider("other", "free", shapes[1], (0.01, 0.0, -0.02), (0.9, 0.1, 0.3, 0.2))]
+
+
+def contacts(s: Situation, colliders: list[Collider], friction: FrictionLaw | None) -> BodyContact:
+    rules = ContactRules(NormalForce(1e4), friction)
+    (term,) = contact_terms(s.articulation, colliders, (), rules)
+    assert isinstance(term, BodyContact)
+    return dataclasses.replace(term, grip=0.7 * torch.ones_like(term.grip), slack=1.0)
+
+
+@pytest.mark.parametrize("friction", [None, STICKING, SLIDING], ids=["smooth", "sticking", "sliding"])
+@pytest.mark.parametrize("kind", SHAPES)
+def test_jacobian_is_exact(kind: str, friction: FrictionLaw | None) -> None:
+    """J of both bodies and their coupling against central differences of r, in worlds that touch."""
+    s, colliders = two_arms(SHAPES[kind], (4,))
+    term = contacts(s, colliders, friction)
+    prepared = term.prepare(s.context(s.q))
+    depth = term.force(prepared, place(s.articulation, s.q)).at.depth
+    assert bool((depth > 1e-3).any(-1).all())
+
+    def balance(q: Tensor) -> Tensor:
+        return s.balance([term], q).residual
+
+    expected = jacobian(s.articulation, balance, s.q)
+    assert relative_error(s.balance([term], s.q).jacobian, expected, floor=1e-3 * balance(s.q).abs().amax(-1)) <= 1e-7
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_momentum_is_kept(kind: str) -> None:
+    """The wrenches about the world's origin sum to zero over the links."""
+    s, colliders = two_arms(SHAPES[kind], (4,))
+    term = contacts(s, colliders, SLIDING)
+    moment = term.load(term.prepare(s.context(s.q)), place(s.articulation, s.q)).moment
+    size = float(moment.abs().max())
+    assert size > 1
+    assert float(moment[..., 3].sum(-2).abs().max()) <= 1e-13 * size
+    assert float(unskew(moment[..., :3]).sum(-2).abs().max()) <= 1e-12 * size
+
+
+def test_obstacle_as_a_body() -> None:
+    """A box against a fixed box: the Jacobian, and nothing but the box feels it."""
+    s, colliders = two_arms((Box((0.2, 0.3, 0.15)), Box((0.25, 0.2, 0.2))), (3,))
+    arm = place(s.articulation, s.q).poses[..., 1, :, :]
+    wall = Obstacle("wall", Box((0.25, 0.2, 0.2)), arm[..., :3, 3] + 0.2)
+    (term,) = contact_terms(s.articulation, colliders[:1], (wall,), ContactRules(NormalForce(1e4), SLIDING))
+    expected = jacobian(s.articulation, lambda q: s.balance([term], q).residual, s.q)
+    balance = s.balance([term], s.q)
+    assert float(balance.residual.abs().max()) > 1
+    assert float(balance.residual[..., s.articulation.topology.free_v].abs().max()) == 0
+    assert relative_error(balance.jacobian, expected, floor=1e-3 * balance.residual.abs().amax(-1)) <= 1e-7
