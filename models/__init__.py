@@ -2,11 +2,14 @@
 
 from collections.abc import Callable
 
-from pbfd_torch.models.boxes import box_slide, box_slope, stack
+from pbfd_torch.models.boxes import box_slide, box_slope
 from pbfd_torch.models.chains import chain_fixed, chain_free, chain_ground, chain_heavy, chain_slope, chain_slope_drop
+from pbfd_torch.models.grounds import conveyor, mesh_terrain, ramp_grid, turntable
+from pbfd_torch.models.manipulation import gripper, robot_arm
 from pbfd_torch.models.robots import file_setup, hopper, robot_setup, walker
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
+from pbfd_torch.models.stacks import arch, heavy_on_light, stack, stack_10
 
 SCENES: dict[str, Callable[..., Setup]] = {
     "box-slide": box_slide,
@@ -19,6 +22,15 @@ SCENES: dict[str, Callable[..., Setup]] = {
     "chain-free": chain_free,
     "dzhanibekov": dzhanibekov,
     "stack": stack,
+    "stack-10": stack_10,
+    "heavy-on-light": heavy_on_light,
+    "arch": arch,
+    "turntable": turntable,
+    "conveyor": conveyor,
+    "ramp-grid": ramp_grid,
+    "mesh-terrain": mesh_terrain,
+    "gripper": gripper,
+    "robot-arm": robot_arm,
     "hopper": hopper,
     "walker": walker,
 }

@@ -1,4 +1,4 @@
-"""Boxes on the ground: sliding to rest, held and slipping on a slope, and resting side by side."""
+"""Boxes on the ground: sliding to rest, and held and slipping on a slope."""
 
 from __future__ import annotations
 
@@ -100,20 +100,3 @@ def box_slope(worlds: int = 2, dtype: torch.dtype = torch.float64, device: torch
         }
 
     return Setup(scene, q, q.new_zeros(worlds, 6), 5.0, 0.02, report)
-
-
-def stack(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
-    """Five boxes at rest on the ground side by side. They do not see each other yet: a stack proper needs contact between boxes."""
-    names = [f"box{k}" for k in range(5)]
-    scene = _scene(names, torch.full((worlds,), 0.5), 0.0, "stack", dtype, torch.device(device))
-    q = repeated(scene.articulation.rest, worlds)
-    for k in range(5):
-        q[:, 7 * k] = 0.3 * k
-        q[:, 7 * k + 2] = _resting_height(0.0)
-
-    def report(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
-        moved = rollout.link_poses[-1, ..., 3] - rollout.link_poses[0, ..., 3]
-        return {"largest_move_m": torch.linalg.vector_norm(moved, dim=-1).amax(-1).tolist()}
-
-    note = "boxes rest on the ground only: contact between bodies is not modelled in this version"
-    return Setup(scene, q, q.new_zeros(worlds, 30), 10.0, 0.02, report, (note,))

@@ -70,14 +70,14 @@ def chain_colliders(count: int = 10, points: int = 2) -> list[Collider]:
 
 def _scene(
     title: str, dtype: torch.dtype, device: torch.device | str, *, free: bool, mu: float | None, slope: float = 0.0,
-    gravity: float = GRAVITY, last_mass: float = MASS, stiffness: float = STIFFNESS,
+    gravity: float = GRAVITY, last_mass: float = MASS, stiffness: float = STIFFNESS, points: int = 2,
 ) -> Scene:  # fmt: skip
     articulation = Articulation.from_links(chain_links(free=free, last_mass=last_mass), dtype, device)
     terms: list[Term] = [Inertia()]
     colliders: list[Collider] = []
     obstacles: tuple[HalfSpace, ...] = ()
     if mu is not None:
-        colliders, obstacles = chain_colliders(), (HalfSpace(),)
+        colliders, obstacles = chain_colliders(points=points), (HalfSpace(),)
         terms.append(Contact.between(articulation, colliders, obstacles[0], NormalForce(stiffness), CoulombFriction(mu)))
     down = torch.tensor([gravity * math.sin(slope), 0.0, -gravity * math.cos(slope)], dtype=dtype, device=device)
     return Scene(articulation, tuple(terms), down, colliders, obstacles, title)
@@ -163,11 +163,11 @@ def _margin(setup: Setup, rollout: Rollout) -> Tensor:
     return beyond[:, 0] - 0.5 * SLIDE * duration**2 + SLOPE_FRICTION * beyond[:, 2]
 
 
-def chain_slope(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
+def chain_slope(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu", points: int = 2) -> Setup:
     """Laid straight on a slope of 30° (gravity is turned instead), μ = .3: slides ½ g (sin 30° − μ cos 30°) T², 117.814 m in
     10 s."""
-    scene = _scene("chain-slope", dtype, device, free=True, mu=SLOPE_FRICTION, slope=SLOPE)
-    q = _placed(scene, worlds, 0.0, -math.sqrt(MASS * GRAVITY * math.cos(SLOPE) / 2 / STIFFNESS))
+    scene = _scene("chain-slope", dtype, device, free=True, mu=SLOPE_FRICTION, slope=SLOPE, points=points)
+    q = _placed(scene, worlds, 0.0, -math.sqrt(MASS * GRAVITY * math.cos(SLOPE) / points / STIFFNESS))
 
     def report(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
         moved = (rollout.center_of_mass[-1] - rollout.center_of_mass[0])[:, 0]

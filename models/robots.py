@@ -17,7 +17,7 @@ _HERE = Path(__file__).parent
 
 def robot_setup(robot: Robot, worlds: int = 1, duration: float = 2.0, keyframe: str | None = None) -> Setup:
     """The robot at its rest configuration without control, or in a named state of its file, whose control is held. A robot that
-    can fall and whose file knows no ground gets a level one just below it. Raises `InputError` for an unknown keyframe."""
+    can fall and whose file holds no obstacle gets level ground just below it. Raises `InputError` for an unknown keyframe."""
     free = any(size == (7, 6) for size in robot.articulation.topology.joint_sizes)
     notes = [f"not modelled: {line}" for line in robot.not_modelled]
     obstacles = robot.obstacles

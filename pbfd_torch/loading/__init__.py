@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -12,23 +13,25 @@ from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.loading.mjcf import load_mjcf
 from pbfd_torch.loading.report import existing_file
 from pbfd_torch.loading.robot import Keyframe, Robot
+from pbfd_torch.loading.srdf import load_srdf_exclusions
 from pbfd_torch.loading.urdf import load_urdf
 
-__all__ = ["Keyframe", "Robot", "load_mjcf", "load_robot", "load_urdf"]
+__all__ = ["Keyframe", "Robot", "load_mjcf", "load_robot", "load_srdf_exclusions", "load_urdf"]
 
 
 def load_robot(
     path: str | os.PathLike[str],
     *,
     free_base: bool | None = None,
+    excluded: Sequence[tuple[str, str]] = (),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Robot:
     """Loads a URDF file (.urdf, or .xml with root <robot>) or an MJCF file (.xml or .mjcf with root <mujoco>).
 
-    `free_base`, URDF only: see `load_urdf`; an MJCF file says itself what is free. Raises `ModelError` naming the file and the
-    element that cannot be used, and `InputError` for `free_base` with MJCF. What the file asks for and the simulation leaves out
-    is in `Robot.not_modelled`, and given as `NotModelledWarning`.
+    `free_base` and `excluded`, URDF only: see `load_urdf`; an MJCF file says itself what is free and what never touches. Raises
+    `ModelError` naming the file and the element that cannot be used, and `InputError` for these two with MJCF. What the file asks
+    for and the simulation leaves out is in `Robot.not_modelled`, and given as `NotModelledWarning`.
     """
     file = existing_file(path)
     suffix = file.suffix.lower()
@@ -37,11 +40,13 @@ def load_robot(
         raise ModelError(f"extension '{file.suffix}' is not known: must be .urdf, .xml or .mjcf{hint}", file=str(file))
     root = "robot" if suffix == ".urdf" else _root_tag(file)
     if root == "robot":
-        return load_urdf(file, free_base=free_base, dtype=dtype, device=device)
+        return load_urdf(file, free_base=free_base, excluded=excluded, dtype=dtype, device=device)
     if root != "mujoco":
         raise ModelError(f"root element is <{root}>: must be <robot> (URDF) or <mujoco> (MJCF)", file=str(file))
     if free_base is not None:
         raise InputError(f"free_base is {free_base}: an MJCF file says itself what is free (<freejoint/>), leave it out")
+    if excluded:
+        raise InputError("excluded is given: an MJCF file says itself what never touches (<exclude/>), leave it out")
     return load_mjcf(file, dtype=dtype, device=device)
 
 

@@ -14,7 +14,7 @@ from pbfd_torch.errors import ModelError
 from pbfd_torch.kinematics import retract
 from pbfd_torch.loading.joint_terms import JointProperties, articulate
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
-from pbfd_torch.loading.mjcf_colliders import mjcf_shapes
+from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
 from pbfd_torch.loading.mjcf_features import left_out
 from pbfd_torch.loading.mjcf_model import CompiledModel, compile_mjcf
 from pbfd_torch.loading.report import naming, warn_not_modelled
@@ -25,27 +25,30 @@ from pbfd_torch.terms.actuators import Actuators
 def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Robot:
     """Loads an MJCF file: q and v have the layout of MuJoCo's qpos and qvel.
 
-    Geoms that can collide become colliders, planes fixed to the world become obstacles, meshes become their convex hulls. A
-    geom with condim 1 is frictionless. Numbers of MuJoCo's own method (time step, integrator, solver, solref, solimp, margin)
-    are not read. Raises `ModelError` with MuJoCo's own words, or naming the element that cannot be used.
+    Geoms that can collide become colliders, those fixed to the world obstacles. Meshes become their convex hulls; a height field
+    goes on beyond its border and has no bottom. Who touches whom is as in MuJoCo (contype, conaffinity, <exclude>, <pair>; not a
+    body and its parent), also where shapes overlap. A geom with condim 1 is frictionless. Numbers of MuJoCo's own method (time
+    step, integrator, solver, solref, solimp, margin) are not read. Raises `ModelError` with MuJoCo's own words, or naming the
+    element that cannot be used.
     """
     model = compile_mjcf(Path(path))
     with naming(str(path)):
         gravity = _gravity(model)
         articulation, terms = articulate(_links(model), _properties(model), math.hypot(*gravity), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
-        colliders, obstacles, lost = mjcf_shapes(model)
+        collisions = mjcf_collisions(model)
     actuators = Actuators.from_list(articulation, drives) if drives else None
     return Robot(
         name=model.name,
         articulation=articulation,
         joint_terms=terms,
         actuators=actuators,
-        colliders=colliders,
-        obstacles=obstacles,
+        colliders=collisions.colliders,
+        obstacles=collisions.obstacles,
+        excluded=collisions.excluded,
         gravity=gravity,
         keyframes=_keyframes(model, articulation, controls),
-        not_modelled=warn_not_modelled(model.path, [*idle, *lost, *left_out(model)]),
+        not_modelled=warn_not_modelled(model.path, [*idle, *collisions.left_out, *left_out(model)]),
     )
 
 

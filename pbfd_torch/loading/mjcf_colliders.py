@@ -1,113 +1,138 @@
-"""Collision shapes of an MJCF file: colliders on links, half-spaces in the world."""
+"""Collision shapes of an MJCF file: colliders on links, obstacles in the world, and which of them never touch."""
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Shape, Sphere
+from pbfd_torch.contact.height_field import HeightField
+from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Shape, Solid, Sphere
+from pbfd_torch.loading.collisions import Collisions, as_solid
 from pbfd_torch.loading.meshes import HullLosses, reduced_hull
-from pbfd_torch.loading.mjcf_model import CompiledModel, label
+from pbfd_torch.loading.mjcf_model import CompiledModel
 from pbfd_torch.loading.report import listing, naming
 
 _PAIR_BIT = 32  # MuJoCo's bits of contype and conaffinity end below
 
 
-def mjcf_shapes(model: CompiledModel) -> tuple[tuple[Collider, ...], tuple[HalfSpace, ...], list[str]]:
-    """Colliders, obstacles, and lines on shapes that are left out. Raises `ModelError` naming the geom."""
-    m = model.data
-    if model.disabled("contact"):
-        return (), (), []
-    paired = {g for pair in _pairs(model) for g in pair}
-    active = [g for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g] or g in paired]
-    standing = [g for g in active if model.standing[m.geom_bodyid[g]]]
-    planes = [g for g in standing if _kind(model, g) == "plane"]
-    losses = HullLosses()
-    colliders, odd = [], []
-    for g in active:
-        if g in standing:
-            continue
-        with naming(str(model.path), f"geom '{model.geom(g)}'"):
-            shape = _shape(model, g, losses)
-            if shape is None:
-                odd.append(f"{model.geom(g)} ({_kind(model, g)})")
-            else:
-                colliders.append(_collider(model, g, shape, planes))
-    with naming(str(model.path)):
-        obstacles = [_half_space(model, g, 1 << (_PAIR_BIT + k) if g in paired else 0) for k, g in enumerate(planes)]
-    lines = losses.lines()
-    if odd:
-        lines.append(f"geoms of links that cannot collide: {listing(odd)}")
-    moving = [g for g in active if g not in standing]
-    if walls := [model.geom(g) for g in standing if g not in planes and _meets(model, g, moving)]:
-        lines.append(f"geoms fixed to the world, other than planes, are no obstacles ({len(walls)}): {listing(walls)}")
-    return tuple(colliders), tuple(obstacles), lines
+def mjcf_collisions(model: CompiledModel) -> Collisions:
+    """What can collide. Raises `ModelError` naming the geom."""
+    return Collisions() if model.disabled("contact") else _Reader(model).collisions()
 
 
-def _meets(model: CompiledModel, g: int, others: list[int]) -> bool:
-    """Whether MuJoCo lets a geom touch any of some others."""
-    m = model.data
-    allowed = (m.geom_contype[g] & m.geom_conaffinity[others]) | (m.geom_contype[others] & m.geom_conaffinity[g])
-    return bool(allowed.any()) or any((x == g and y in others) or (y == g and x in others) for x, y in _pairs(model))
+@dataclass(frozen=True, eq=False)
+class _Reader:
+    model: CompiledModel
 
+    def collisions(self) -> Collisions:
+        model, m = self.model, self.model.data
+        losses = HullLosses()
+        colliders: list[Collider] = []
+        obstacles: dict[int, HalfSpace | Obstacle] = {}
+        odd = []
+        paired = {g for pair in model.pairs for g in pair}
+        for g in range(m.ngeom):
+            if not (m.geom_contype[g] or m.geom_conaffinity[g] or g in paired):
+                continue
+            with naming(str(model.path), f"geom '{model.geom(g)}'"):
+                found = self._obstacle(g, losses) if model.standing[m.geom_bodyid[g]] else self._collider(g, losses)
+                if isinstance(found, Collider):
+                    colliders.append(found)
+                elif found is not None:
+                    obstacles[g] = found
+                else:
+                    odd.append(f"{model.geom(g)} ({model.geom_type(g)})")
+        lines = losses.lines()
+        if odd:
+            lines.append(f"geoms that cannot collide: {listing(odd)}")
+        return Collisions(tuple(colliders), tuple(obstacles.values()), self._excluded(obstacles), tuple(lines))
 
-def _pairs(model: CompiledModel) -> set[tuple[int, int]]:
-    """Geoms that an explicit <pair> lets touch, whatever their bits."""
-    return {(int(x), int(y)) for x, y in zip(model.data.pair_geom1, model.data.pair_geom2, strict=True)}
+    def _excluded(self, obstacles: dict[int, HalfSpace | Obstacle]) -> tuple[tuple[str, str], ...]:
+        """Pairs of names: a moving body is called by its own, a standing one by those of its obstacles."""
+        model = self.model
 
+        def names(body: int) -> list[str]:
+            if not model.standing[body]:
+                return [model.body(body)]
+            return [x.name for g, x in obstacles.items() if model.data.geom_bodyid[g] == body]
 
-def _kind(model: CompiledModel, g: int) -> str:
-    return label("mjtGeom", model.data.geom_type[g])
+        moving = [(a, b) for a, b in model.excludes if not (model.standing[a] and model.standing[b])]
+        return tuple(pair for a, b in moving for pair in itertools.product(names(a), names(b)))
 
+    def _shape(self, g: int, losses: HullLosses) -> Shape | None:
+        model, m = self.model, self.model.data
+        a, b, c = m.geom_size[g].tolist()
+        match model.geom_type(g):
+            case "sphere":
+                return Sphere(a)
+            case "capsule":
+                return Capsule(a, b)
+            case "cylinder":
+                return Cylinder(a, b)
+            case "box":
+                return Box((a, b, c))
+            case "ellipsoid":
+                return Ellipsoid((a, b, c))
+            case "mesh":
+                mesh = int(m.geom_dataid[g])
+                first, count = int(m.mesh_vertadr[mesh]), int(m.mesh_vertnum[mesh])
+                name = model.mesh(mesh)
+                return losses.keep(name, reduced_hull(m.mesh_vert[first : first + count].astype(float), name=name))
+        return None
 
-def _shape(model: CompiledModel, g: int, losses: HullLosses) -> Shape | None:
-    m = model.data
-    a, b, c = m.geom_size[g].tolist()
-    match _kind(model, g):
-        case "sphere":
-            return Sphere(a)
-        case "capsule":
-            return Capsule(a, b)
-        case "cylinder":
-            return Cylinder(a, b)
-        case "box":
-            return Box((a, b, c))
-        case "ellipsoid":
-            return Ellipsoid((a, b, c))
-        case "mesh":
-            mesh = int(m.geom_dataid[g])
-            first, count = int(m.mesh_vertadr[mesh]), int(m.mesh_vertnum[mesh])
-            name = model.mesh(mesh)
-            return losses.keep(name, reduced_hull(m.mesh_vert[first : first + count].astype(float), name=name))
-    return None
+    def _height_field(self, g: int) -> HeightField:
+        """MuJoCo's rows run along y and its columns along x; heights are shares of the field's own."""
+        m = self.model.data
+        k = int(m.geom_dataid[g])
+        rows, columns, first = int(m.hfield_nrow[k]), int(m.hfield_ncol[k]), int(m.hfield_adr[k])
+        x, y, top, _ = m.hfield_size[k].tolist()
+        shares = m.hfield_data[first : first + rows * columns].astype(float).reshape(rows, columns)
+        return HeightField(top * shares.T, (2 * x / (columns - 1), 2 * y / (rows - 1)))
 
+    def _collider(self, g: int, losses: HullLosses) -> Collider | None:
+        model, m = self.model, self.model.data
+        shape = self._shape(g, losses)
+        if shape is None:
+            return None
+        return Collider(
+            name=model.geom(g),
+            link=model.body(int(m.geom_bodyid[g])),
+            shape=shape,
+            position=tuple(m.geom_pos[g].tolist()),
+            quaternion=tuple(m.geom_quat[g].tolist()),
+            **self._touching(g),
+        )
 
-def _collider(model: CompiledModel, g: int, shape: Shape, planes: list[int]) -> Collider:
-    m = model.data
-    explicit = sum(1 << (_PAIR_BIT + k) for k, plane in enumerate(planes) if {(g, plane), (plane, g)} & _pairs(model))
-    return Collider(
-        name=model.geom(g),
-        link=model.body(int(m.geom_bodyid[g])),
-        shape=shape,
-        position=tuple(m.geom_pos[g].tolist()),
-        quaternion=tuple(m.geom_quat[g].tolist()),
-        friction=float(m.geom_friction[g, 0]),
-        group=int(m.geom_contype[g]) | explicit,
-        mask=int(m.geom_conaffinity[g]),
-        priority=int(m.geom_priority[g]),
-        frictionless=bool(m.geom_condim[g] == 1),
-    )
+    def _obstacle(self, g: int, losses: HullLosses) -> HalfSpace | Obstacle | None:
+        model = self.model
+        position, turn = model.placed.geom_xpos[g], model.placed.geom_xmat[g].reshape(3, 3)
+        kind, name, touching = model.geom_type(g), self._obstacle_name(g), self._touching(g)
+        if kind == "plane":
+            normal = turn[:, 2]
+            return HalfSpace(name=name, normal=tuple(normal.tolist()), offset=float(normal @ position), **touching)
+        shape = self._shape(g, losses)
+        solid: Solid | None = self._height_field(g) if kind == "hfield" else None if shape is None else as_solid(shape)
+        if solid is None:
+            return None
+        return Obstacle(name, solid, tuple(position.tolist()), model.geom_quaternion(g), **touching)
 
+    def _obstacle_name(self, g: int) -> str:
+        """That of the geom, unless a link that moves has it: `Robot.excluded` knows both by their names."""
+        model, name = self.model, self.model.geom(g)
+        taken = any(model.body(b) == name for b in range(model.data.nbody) if not model.standing[b])
+        return f"{name} (geom)" if taken else name
 
-def _half_space(model: CompiledModel, g: int, pair_bit: int) -> HalfSpace:
-    """`pair_bit`: what colliders that an explicit <pair> lets touch this plane have in their group, or 0."""
-    m = model.data
-    normal = model.placed.geom_xmat[g].reshape(3, 3)[:, 2]
-    return HalfSpace(
-        name=model.geom(g),
-        normal=tuple(normal.tolist()),
-        offset=float(normal @ model.placed.geom_xpos[g]),
-        friction=float(m.geom_friction[g, 0]),
-        group=int(m.geom_contype[g]),
-        mask=int(m.geom_conaffinity[g]) | pair_bit,
-        priority=int(m.geom_priority[g]),
-        frictionless=bool(m.geom_condim[g] == 1),
-    )
+    def _touching(self, g: int) -> dict[str, Any]:
+        """What it touches, and how. Each <pair> gives a bit of its own to the group of one geom and the mask of the other."""
+        m = self.model.data
+        bits = [1 << (_PAIR_BIT + k) for k in range(len(self.model.pairs))]
+        return {
+            "friction": float(m.geom_friction[g, 0]),
+            "group": int(m.geom_contype[g]) | sum(x for x, (a, _) in zip(bits, self.model.pairs, strict=True) if a == g),
+            "mask": int(m.geom_conaffinity[g]) | sum(x for x, (_, b) in zip(bits, self.model.pairs, strict=True) if b == g),
+            "priority": int(m.geom_priority[g]),
+            "frictionless": bool(m.geom_condim[g] == 1),
+        }

@@ -79,13 +79,12 @@ def _of_contacts(model: CompiledModel) -> Iterator[str]:
     m = model.data
     if model.disabled("contact"):
         return
-    if _links_touch(model):
-        yield "contact between links"
-    first, second = m.geom_bodyid[m.pair_geom1], m.geom_bodyid[m.pair_geom2]
-    if (model.standing[first] != model.standing[second]).any():
+    moving = [p for p, (a, b) in enumerate(model.pairs) if not model.standing[m.geom_bodyid[[a, b]]].all()]
+    if moving:
         yield "friction of contact pairs: that of their geoms is used"
-    excluded = [model.body(b) for a, b in _excludes(model) if model.standing[a] and not model.standing[b]]
-    yield from _named("excluded contact with the world", excluded)
+    yield from _named("contact pairs of bodies that are joined or excluded", [model.pair(p) for p in moving if _barred(model, p)])
+    if model.disabled("filterparent"):
+        yield "contact between a body and its parent (filterparent is off)"
     colliding = [g for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]]
     for what, mark in {
         "torsional and rolling friction (condim 4, 6)": m.geom_condim > 3,
@@ -95,23 +94,12 @@ def _of_contacts(model: CompiledModel) -> Iterator[str]:
         yield from _named(what, [model.geom(g) for g in colliding if mark[g]])
 
 
-def _excludes(model: CompiledModel) -> list[tuple[int, int]]:
-    """Pairs of bodies that a file excludes from contact, the smaller number first."""
-    return [(int(s) >> 16, int(s) & 0xFFFF) for s in model.data.exclude_signature]
-
-
-def _links_touch(model: CompiledModel) -> bool:
-    """Whether geoms of two links may collide in MuJoCo: of bodies that can move against each other, neither parent of the other."""
+def _barred(model: CompiledModel, p: int) -> bool:
+    """Whether the bodies of an explicit pair do not touch by other rules, which MuJoCo then does not ask."""
     m = model.data
-    pairs = np.stack((m.geom_bodyid[m.pair_geom1], m.geom_bodyid[m.pair_geom2]), -1)
-    if not model.standing[pairs].any(1).all():
+    one, other = (int(m.geom_bodyid[g]) for g in model.pairs[p])
+    if {(one, other), (other, one)} & set(model.excludes):
         return True
-    geoms = np.flatnonzero(~model.standing[m.geom_bodyid])
-    body = m.body_weldid[m.geom_bodyid[geoms]]
-    parent = m.body_weldid[m.body_parentid[body]]
-    meet = (m.geom_contype[geoms, None] & m.geom_conaffinity[None, geoms]) != 0
-    apart = (body[:, None] != body) & (parent[:, None] != body) & (body[:, None] != parent)
-    for a, b in _excludes(model):
-        apart &= ~((m.geom_bodyid[geoms, None] == a) & (m.geom_bodyid[geoms] == b))
-        apart &= ~((m.geom_bodyid[geoms, None] == b) & (m.geom_bodyid[geoms] == a))
-    return bool((meet & apart).any())
+    one, other = int(m.body_weldid[one]), int(m.body_weldid[other])
+    above = [int(m.body_weldid[m.body_parentid[b]]) for b in (one, other)]
+    return one == other or bool(one and other and (above[0] == other or above[1] == one))

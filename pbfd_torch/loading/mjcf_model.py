@@ -65,6 +65,13 @@ class CompiledModel:
     def equality(self, e: int) -> str:
         return self._named("EQUALITY", e, "equality")
 
+    def pair(self, p: int) -> str:
+        return self._named("PAIR", p, "pair")
+
+    def geom_type(self, g: int) -> str:
+        """plane, sphere, box …"""
+        return label("mjtGeom", self.data.geom_type[g])
+
     def joint_type(self, j: int) -> str:
         """HINGE, SLIDE, BALL or FREE."""
         return label("mjtJoint", self.data.jnt_type[j]).upper()
@@ -99,6 +106,25 @@ class CompiledModel:
         data = mujoco.MjData(self.data)
         mujoco.mj_kinematics(self.data, data)
         return data
+
+    def geom_quaternion(self, g: int) -> tuple[float, float, float, float]:
+        """How a geom is turned in the world at the reference configuration."""
+        import mujoco
+
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, self.placed.geom_xmat[g])
+        w, x, y, z = quaternion.tolist()
+        return w, x, y, z
+
+    @cached_property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Geoms that an explicit <pair> lets touch, whatever their bits."""
+        return [(int(x), int(y)) for x, y in zip(self.data.pair_geom1, self.data.pair_geom2, strict=True)]
+
+    @cached_property
+    def excludes(self) -> list[tuple[int, int]]:
+        """Bodies that an <exclude> keeps from touching."""
+        return [(int(s) >> 16, int(s) & 0xFFFF) for s in self.data.exclude_signature]
 
     def inertia(self, b: int) -> tuple[tuple[float, float, float], ...]:
         """Inertia [kg m²] of a body about its centre of mass, in the body's axes."""

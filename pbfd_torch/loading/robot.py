@@ -8,6 +8,7 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.load import Term
@@ -30,7 +31,8 @@ class Robot:
     joint_terms: armature, damping, springs, dry friction and limits, each present only if the file asks for it.
     actuators: None where there is none; their order is the order of the control vector.
     colliders: collision shapes on links.
-    obstacles: flat obstacles that the file itself contains.
+    obstacles: solids of the world that the file itself contains.
+    excluded: pairs of names of links and obstacles that do not touch.
     gravity: [m/s²].
     keyframes: named states.
     not_modelled: what the file asks for and the simulation leaves out, one line each.
@@ -41,7 +43,8 @@ class Robot:
     joint_terms: tuple[Term, ...] = ()
     actuators: Actuators | None = None
     colliders: tuple[Collider, ...] = ()
-    obstacles: tuple[HalfSpace, ...] = ()
+    obstacles: tuple[HalfSpace | Obstacle, ...] = ()
+    excluded: tuple[tuple[str, str], ...] = ()
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     keyframes: dict[str, Keyframe] = field(default_factory=dict)
     not_modelled: tuple[str, ...] = ()

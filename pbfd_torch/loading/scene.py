@@ -1,4 +1,4 @@
-"""From a robot to a scene: its terms, and contact of its colliders with flat obstacles."""
+"""From a robot to a scene: its terms, and the contacts of its colliders with obstacles and with each other."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import torch
 
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.kinematics import place
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 
 
-def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace] | None = None, penetration: float = 1e-3) -> Scene:
+def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace | Obstacle] | None = None, penetration: float = 1e-3) -> Scene:
     """The robot with everything its file asks for, on its own obstacles or on `obstacles`.
 
     C⊥ is chosen so that the whole weight on one point would rest `penetration` [m] deep; friction is Coulomb's, μ from the file."""
@@ -28,26 +28,12 @@ def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace] | None = None, pene
     terms: list[Term] = [Inertia(), *robot.joint_terms]
     if robot.actuators is not None:
         terms.append(robot.actuators)
-    for obstacle in obstacles:
-        touching = [c for c in robot.colliders if touch(c, obstacle)]
-        if touching:
-            mu = [friction_between(c, obstacle) for c in touching for _ in c.shape.candidates()[1]]
-            friction = CoulombFriction(torch.tensor(mu, dtype=articulation.dtype, device=articulation.device))
-            terms.append(Contact.between(articulation, touching, obstacle, NormalForce.for_weight(weight, penetration), friction))
+    names = {*articulation.link_names, *(x.name for x in obstacles)}
+    excluded = [pair for pair in robot.excluded if names.issuperset(pair)]  # others name obstacles of the file that are not here
+    rules = ContactRules(NormalForce.for_weight(weight, penetration), excluded=excluded)
+    terms += contact_terms(articulation, robot.colliders, obstacles, rules)
     gravity = torch.tensor(robot.gravity, dtype=articulation.dtype, device=articulation.device)
     return Scene(articulation, tuple(terms), gravity, robot.colliders, obstacles, robot.name)
-
-
-def touch(a: Collider | HalfSpace, b: Collider | HalfSpace) -> bool:
-    """Whether two things collide by their groups and masks (MuJoCo's contype and conaffinity)."""
-    return bool((a.group & b.mask) or (b.group & a.mask))
-
-
-def friction_between(a: Collider | HalfSpace, b: Collider | HalfSpace) -> float:
-    """μ of a pair: that of the higher priority, else the larger one; 0 where all that decide are frictionless (MuJoCo's rule)."""
-    highest = max(a.priority, b.priority)
-    deciding = [x for x in (a, b) if x.priority == highest]
-    return 0.0 if all(x.frictionless for x in deciding) else max(x.friction for x in deciding)
 
 
 def ground_below(robot: Robot) -> HalfSpace:

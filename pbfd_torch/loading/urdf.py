@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.joint_terms import JointProperties, articulate
 from pbfd_torch.loading.report import listing, naming, warn_not_modelled
 from pbfd_torch.loading.robot import Robot
-from pbfd_torch.loading.urdf_colliders import urdf_colliders
+from pbfd_torch.loading.urdf_colliders import urdf_collisions
 from pbfd_torch.loading.urdf_file import Parsed, UrdfFile, read_urdf
 from pbfd_torch.loading.urdf_placement import Placed, plane_axes, rotation_matrix
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -29,6 +29,7 @@ def load_urdf(
     path: str | os.PathLike[str],
     *,
     free_base: bool | None = None,
+    excluded: Sequence[tuple[str, str]] = (),
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> Robot:
@@ -38,28 +39,34 @@ def load_urdf(
     has mass. Links come parents first, depth first, in the file's order of joints. Every revolute, continuous and prismatic joint
     gets a torque motor with the joint's effort limit (none if it is 0). A planar joint becomes two slides and a hinge; a floating
     joint becomes a free one (coordinates in the world), or three slides and a ball where its parent can move. Meshes become
-    their convex hulls. Raises `ModelError` naming file, line and element.
+    their convex hulls, and the shapes of links fixed to the world obstacles of the link's name.
+
+    Links touch each other, except for the pairs `excluded` (see `load_srdf_exclusions`), links joined by a joint, and links that
+    overlap by more than 1 mm in the rest configuration: shapes of real robots often do, and would push each other away. The last
+    ones are named in `Robot.not_modelled`; all are in `Robot.excluded`. Raises `ModelError` naming file, line and element, and
+    `InputError` for an unknown link in `excluded`.
     """
     file = read_urdf(Path(path))
     with naming(str(path)):
         root, order = _tree(file)
         free = _has_free_base(file, root, order) if free_base is None else free_base
-        links = _links(file, root, order, free)
+        links, standing = _links(file, root, order, free)
         joints = [x.data for x in file.joints.values()]
         properties = {j.name: _properties(j) for j in joints if j.type in ("revolute", "continuous", "prismatic")}
         articulation, terms = articulate(links, properties, math.hypot(*_GRAVITY), dtype, device)
         driven = [name for name in articulation.joint_names if name in properties]
         actuators = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
-    fixed = {name for name, node in zip(articulation.link_names, articulation.topology.link_node, strict=True) if node == 0}
-    colliders, notes = urdf_colliders(file, [x.name for x in links], fixed)
+    collisions = urdf_collisions(file, articulation, standing, excluded)
     return Robot(
         name=file.name,
         articulation=articulation,
         joint_terms=terms,
         actuators=Actuators.from_list(articulation, actuators) if actuators else None,
-        colliders=colliders,
+        colliders=collisions.colliders,
+        obstacles=collisions.obstacles,
+        excluded=collisions.excluded,
         gravity=_GRAVITY,
-        not_modelled=warn_not_modelled(file.path, [*_ignored(joints), *file.left_out, *notes]),
+        not_modelled=warn_not_modelled(file.path, [*_ignored(joints), *file.left_out, *collisions.left_out]),
     )
 
 
@@ -105,10 +112,11 @@ def _mass(link: Any) -> float:
     return float(link.inertial.mass) if link.inertial else 0.0
 
 
-def _links(file: UrdfFile, root: str, order: list[Parsed], free: bool) -> list[Link]:
+def _links(file: UrdfFile, root: str, order: list[Parsed], free: bool) -> tuple[list[Link], dict[str, Placed]]:
+    """All links, and those fixed to the world with where they are."""
     base = (Joint(f"{root}_free", JointKind.FREE),) if free else ()
     links = [_link(file.links[root], "", Placed.identity(), base)]
-    standing = {} if free else {root: Placed.identity()}  # links fixed to the world, and where
+    standing = {} if free else {root: Placed.identity()}
     for parsed in order:
         joint = parsed.data
         place = Placed.from_origin(joint.origin)
@@ -119,7 +127,7 @@ def _links(file: UrdfFile, root: str, order: list[Parsed], free: bool) -> list[L
             elif joint.type == "fixed" and parent in standing:
                 standing[joint.child] = standing[parent] @ place
             links.append(_link(file.links[joint.child], parent, place, joints))
-    return links
+    return links, standing
 
 
 def _joints(joint: Any) -> Iterator[Joint]:
