@@ -30,11 +30,6 @@ MOST_STEPS, MOST_WORLDS, MOST_REPEATS, MOST_DOFS = 10_000, 4096, 1000, 200
 FILES = ("solvers.json", "fig4.png", "table1.png")
 
 
-@bench.callback()
-def _group() -> None:
-    """Keeps `solvers` a command of its own while it is the only one."""
-
-
 @bench.command()
 def solvers(
     out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-solvers"),
@@ -61,7 +56,7 @@ def solvers(
         raise InputError(f"--dt is {dt} s: must be from {SHORTEST_STEP:g} to {LONGEST_STEP:g}")
     if not (math.isfinite(seconds) and seconds > 0):
         raise InputError(f"--seconds is {seconds}: must be > 0 and finite")
-    check_folder(out)
+    check_folder(out, FILES)
     use_threads(1)
     report = measured(steps, dt, worlds, seconds, counts, batch, repeats)
     write(report, out)
@@ -89,12 +84,12 @@ def parsed_sizes(text: str) -> list[int]:
     return found
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, files: Sequence[str]) -> None:
     """Raises `InputError` now rather than after the measurement."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
-    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in FILES):
+    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in files):
         raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
 
 
@@ -120,16 +115,7 @@ def measured(
             costs[variant.key] = table_1.measure_variant(variant, sizes, repeats, bar.update)
     return {
         "wall_s": time.perf_counter() - started,
-        "environment": {
-            "pbfd_torch": _version(),
-            "torch": torch.__version__,
-            "python": platform.python_version(),
-            "machine": f"{platform.system()} {platform.machine()}",
-            "processor": _processor(),
-            "threads": torch.get_num_threads(),
-            "dtype": "float64",
-            "device": "cpu",
-        },
+        "environment": environment(),
         "figure_4": {"chains": chains, "seconds_per_case": seconds, "repeats": repeats, "notes": list(figure_4.NOTES)},
         "table_1": {
             "sizes": list(sizes),
@@ -143,6 +129,20 @@ def measured(
             },
             "notes": list(table_1.NOTES),
         },
+    }
+
+
+def environment() -> dict[str, Any]:
+    """What the numbers were measured with."""
+    return {
+        "pbfd_torch": _version(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "threads": torch.get_num_threads(),
+        "dtype": "float64",
+        "device": "cpu",
     }
 
 
@@ -205,15 +205,16 @@ def print_report(report: dict[str, Any], folder: Path) -> None:
     print(f"written: {', '.join(str(folder / name) for name in FILES)}")
 
 
-def _table(title: str, *headers: str) -> Table:
-    table = Table(title=title, title_justify="left", header_style="bold cyan", padding=(0, 1, 0, 0), box=None)
+def new_table(title: str, *headers: str) -> Table:
+    """An empty table in the style of the benchmarks."""
+    result = Table(title=title, title_justify="left", header_style="bold cyan", padding=(0, 1, 0, 0), box=None)
     for k, header in enumerate(headers):
-        table.add_column(header, justify="right" if k else "left", overflow="fold")
-    return table
+        result.add_column(header, justify="right" if k else "left", overflow="fold")
+    return result
 
 
 def _figure_4_table(name: str, chain: dict[str, Any]) -> Table:
-    table = _table(
+    table = new_table(
         f"Fig. 4, {name}: {chain['steps']} steps of {chain['dt']:g} s, worlds: {chain['worlds']}; reference solved to "
         f"{_number(chain['reference_residual_norm_max'])}",
         *("case", "budget", "failed\n/steps", "iterations\nmean/p95/max", "time [ms]\nmean/p95/max", "×\ndefault"),
@@ -242,7 +243,7 @@ def _table_1_rows(table: dict[str, Any]) -> Table:
     from pbfd_torch.bench.table_1 import ROWS
 
     fit, (title, found) = table["fit_sizes"], next(iter(table["variants"].items()))
-    result = _table(
+    result = new_table(
         f"Table I, {title}: exponents over n = {fit[0]} … {fit[-1]}, measured (paper)",
         *("case", "gradient", "Hessian", "solve (paper: GPU)", "iteration (paper: GPU, CPU)"),
     )
@@ -258,7 +259,7 @@ def _table_1_rows(table: dict[str, Any]) -> Table:
 
 def _substep_table(title: str, found: dict[str, Any], sizes: Sequence[int]) -> Table:
     columns = [f"n = {n}" for n in sizes]
-    result = _table(
+    result = new_table(
         f"{title} (autodiff: {found['worlds_of_autodiff']}): time per world [µs]", "substep", *columns, "exponent", "error"
     )
     for row in found["substeps"].values():

@@ -10,6 +10,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.errors import InputError
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES
@@ -66,11 +68,18 @@ def describe(robot: Robot) -> dict[str, Any]:
         "links": links,
         "joints": joints,
         "actuators": list(robot.actuators.names) if robot.actuators else [],
-        "obstacles": [{"name": o.name, "normal": list(o.normal), "offset_m": o.offset} for o in robot.obstacles],
+        "obstacles": [_obstacle(x) for x in robot.obstacles],
         "keyframes": list(robot.keyframes),
         "terms": [type(term).__name__ for term in robot.joint_terms],
         "not_modelled": list(robot.not_modelled),
     }
+
+
+def _obstacle(obstacle: HalfSpace | Obstacle) -> dict[str, Any]:
+    if isinstance(obstacle, HalfSpace):
+        return {"name": obstacle.name, "shape": "HalfSpace", "normal": list(obstacle.normal), "offset_m": obstacle.offset}
+    position = torch.as_tensor(obstacle.position).tolist()
+    return {"name": obstacle.name, "shape": type(obstacle.shape).__name__, "position_m": position}
 
 
 def _finite(value: torch.Tensor) -> float | None:
@@ -110,5 +119,10 @@ def _print(contents: dict[str, Any]) -> None:
     for key in ("actuators", "keyframes", "terms"):
         print(f"{key}: {', '.join(contents[key]) or 'none'}")
     for obstacle in contents["obstacles"]:
-        print(f"obstacle: {obstacle['name']}, half-space with normal {obstacle['normal']} at {obstacle['offset_m']:.4g} m")
+        place = (
+            f"at {obstacle['offset_m']:.4g} m along {obstacle['normal']}"
+            if "normal" in obstacle
+            else f"at {obstacle['position_m']}"
+        )
+        print(f"obstacle: {obstacle['name']}, {obstacle['shape']} {place}")
     print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"))

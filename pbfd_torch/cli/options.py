@@ -17,8 +17,10 @@ from pbfd_torch.simulator import Solver
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
-from pbfd_torch.terms.contact import Contact, FrictionLaw
+from pbfd_torch.terms.body_contact import BodyContact
+from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 
 CALIBRATION_SPEED = 1.0  # [m/s] at which the PBFD law's C∥ gives the scene's μ
@@ -140,18 +142,18 @@ def _shaken(setup: Setup, seed: int) -> Setup:
 def with_friction(setup: Setup, choice: Friction | None, dt: float) -> Setup:
     """The setup with another friction law in all its contacts; the PBFD laws are calibrated to its μ at 1 m/s and this Δt.
     Raises `InputError` where there is no contact."""
-    if choice is not None and not any(isinstance(term, Contact) for term in setup.scene.terms):
+    if choice is not None and not any(isinstance(term, Contact | BodyContact) for term in setup.scene.terms):
         raise InputError(f"--friction is {choice.value}, but nothing can touch in '{setup.scene.name}': leave it out")
     if choice is None or choice is Friction.COULOMB:
         return setup
     terms = [
-        dataclasses.replace(term, friction=_law(choice, term, dt)) if isinstance(term, Contact) else term
+        dataclasses.replace(term, friction=_law(choice, term, dt)) if isinstance(term, Contact | BodyContact) else term
         for term in setup.scene.terms
     ]
     return dataclasses.replace(setup, scene=dataclasses.replace(setup.scene, terms=tuple(terms)))
 
 
-def _law(choice: Friction, contact: Contact, dt: float) -> FrictionLaw | None:
+def _law(choice: Friction, contact: Contact | BodyContact, dt: float) -> FrictionLaw | None:
     if choice is Friction.NONE or not isinstance(contact.friction, CoulombFriction):
         return None
     base = PbfdFriction.as_printed(0.0) if choice is Friction.PBFD_PRINTED else PbfdFriction.as_derived(0.0)

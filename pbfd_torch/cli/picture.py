@@ -15,6 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
+from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.models import Setup
 from pbfd_torch.rollout import Rollout
 
@@ -57,6 +58,8 @@ def _strobe(axes: Axes, setup: Setup, rollout: Rollout, strobe_s: float) -> None
     span = np.concatenate(seen)
     low, high = span.min(0) - 0.12, span.max(0) + 0.12
     for obstacle in setup.scene.obstacles:
+        if not isinstance(obstacle, HalfSpace):
+            continue
         along = np.array([low[0] - 5, high[0] + 5])
         normal = turn @ np.array(obstacle.normal)
         surface = (obstacle.offset - normal[0] * along) / normal[1]
