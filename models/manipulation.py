@@ -30,15 +30,20 @@ TURN, SHOULDER, ELBOW, WRIST = 0.0, 0.95, 1.35, 0.8  # where the arm starts [rad
 
 
 def gripper(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
-    """Two fingers pinch a capsule of 45 g between flat pads with 12 N each, μ = 1, anchored friction: it does not slide in a minute."""
+    """Two fingers pinch a capsule of 45 g between flat pads with 12 N each, μ = 1, friction with anchors: it does not slide."""
     across = OBJECT_MASS * (3 * RADIUS**2 + (2 * HALF_LENGTH) ** 2) / 12
     along = OBJECT_MASS * RADIUS**2 / 2
     inertia = ((across, 0.0, 0.0), (0.0, across, 0.0), (0.0, 0.0, along))
     small = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))
     reach = RADIUS + PAD[0] - math.sqrt(GRIP / 2 / STIFFNESS)  # two points carry each finger's force
     links = [
-        Link(f"finger{k}", "", (side * reach, 0.0, 0.0), joints=(Joint(f"slide{k}", JointKind.SLIDE, (1.0, 0.0, 0.0)),),
-             mass=FINGER_MASS, inertia=small)
+        Link(
+            f"finger{k}",
+            position=(side * reach, 0.0, 0.0),
+            joints=(Joint(f"slide{k}", JointKind.SLIDE, (1.0, 0.0, 0.0)),),
+            mass=FINGER_MASS,
+            inertia=small,
+        )
         for k, side in enumerate((-1.0, 1.0))
     ]  # fmt: skip
     links.append(Link("capsule", joints=(Joint("free", JointKind.FREE),), mass=OBJECT_MASS, inertia=inertia))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pbfd_torch.assembly import Balance
 from pbfd_torch.kinematics import Motion, Placement, retract
-from pbfd_torch.terms.load import Foretelling, ForetellingLoad, LinkLoad, Term
+from pbfd_torch.terms.load import LinkLoad, Term
 
 
 class Outlook:
@@ -28,14 +28,12 @@ class Outlook:
         self._foretold: list[Callable[[Tensor], Tensor]] = []
         self._on_joints: list[tuple[Term, Any]] = []
         for term, fixed, load in zip(terms, prepared, balance.loads, strict=True):
-            if isinstance(load, ForetellingLoad):
-                self._foretold.append(load.outlook(self._motion))
-            elif isinstance(term, Foretelling):
-                self._foretold.append(term.outlook(fixed, self._motion))
-            elif isinstance(load, LinkLoad):
+            if not isinstance(load, LinkLoad):
+                self._on_joints.append((term, fixed))
+            elif load.outlook is None:
                 self._add_linear(load)
             else:
-                self._on_joints.append((term, fixed))
+                self._foretold.append(load.outlook(self._motion))
 
     def _add_linear(self, load: LinkLoad) -> None:
         """⟨M, [V]⟩ and its change V·A V + ⟨M, [V̇] + [V]²⟩, M the moment and A the stiffness."""

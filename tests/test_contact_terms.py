@@ -236,7 +236,7 @@ for shape in (Box((0.1, 0.1, 0.1)), HULL):
     a = two_free()
     terms = contact_terms(a, [Collider("one", "a", Box((0.2, 0.2, 0.1))), Collider("other", "b", shape)])
     q = a.rest.clone()
-    q[9] = 0.2
+    q[9] = 0.1 - shape.candidates()[0][:, 2].min() + 0.005
     simulate(Scene(a, (Inertia(), *terms), torch.zeros(3, dtype=torch.float64)), q[None])
 assert "fcl" in sys.modules
 """

@@ -72,7 +72,9 @@ def test_points_move_to_second_order(case: TermCase) -> None:
     d = tangent(s.articulation, 3, (3,))
     assert isinstance(term, Contact)
     placement = place(s.articulation, s.q)
-    outlook = term.load(prepared, placement).outlook(Motion(placement, d))
+    foretell = term.load(prepared, placement).outlook
+    assert foretell is not None
+    outlook = foretell(Motion(placement, d))
     with_inertia, only_inertia = objective(s, (Inertia(), term)), objective(s, (Inertia(),))
 
     def true(a: float) -> Tensor:

@@ -33,6 +33,7 @@ from tests.solver_problems import METHODS, ROOT_METHODS, changed
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 AGREEMENT = 1e-8
 TIGHT = 1e-11  # of the force scale: at the default tolerance, a chain's soft modes leave more than AGREEMENT to move
+ENOUGH = 800  # evaluations; L-BFGS needs 400 to 600 to that tolerance, as rounding has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +122,7 @@ def step_of(name: str, dtype: torch.dtype) -> Step:
 FLAT = "½‖r‖² squares the condition number, here about 1e7: first-order progress only, the budget of 400 evaluations runs out"
 SHALLOW = "½‖r‖² falls to a non-zero minimum first (the gap of Lemma 4.2), and further only along its bottom: the budget runs out"
 MANY = "ten links pushed together: about 2000 evaluations, more than the budget"
-ROOT_LIMITS = {("three links landing", "L-BFGS on GE"): FLAT, ("ten links landing", "L-BFGS on GE"): FLAT}
+ROOT_LIMITS = {("ten links landing", "L-BFGS on GE"): FLAT}
 ENERGY_LIMITS = {
     ("two links landing", "JTJ-LM"): SHALLOW,
     ("three links landing", "JTJ-LM"): SHALLOW,
@@ -157,7 +158,7 @@ def assert_reached(step: Step, solution: Solution, known: str | None) -> None:
 def test_root_methods_agree(case: str, name: str) -> None:
     """Wherever GE reaches 0, all methods reach the same q to 1e-8; the others say that they did not solve it."""
     step = step_of(case, torch.float64)
-    method = changed(ROOT_METHODS[name], tolerance=TIGHT, max_evaluations=800)  # L-BFGS may need more than its 400
+    method = changed(ROOT_METHODS[name], tolerance=TIGHT, max_evaluations=ENOUGH)
     assert_reached(step, method.solve(step.objective, start_of(step, case, name), step.retreat), ROOT_LIMITS.get((case, name)))
 
 
@@ -167,7 +168,7 @@ def test_methods_agree_on_the_minimum(case: str, name: str) -> None:
     """With the friction lagged at the step's end, that end is the energy's minimiser: those that minimise E and those that look for
     the root of its gradient reach it to 1e-8."""
     step = step_of(case, torch.float64)
-    method = changed(METHODS[name], tolerance=TIGHT)
+    method = changed(METHODS[name], tolerance=TIGHT, max_evaluations=ENOUGH)
     assert_reached(step, method.solve(step.energy, start_of(step, case, name), step.retreat), ENERGY_LIMITS.get((case, name)))
 
 

@@ -19,6 +19,7 @@ from tqdm import tqdm
 from pbfd_torch.asynchronous import AsynchronousRollout
 from pbfd_torch.cli.options import Choices, Schedule, with_friction
 from pbfd_torch.errors import InputError
+from pbfd_torch.hazards import Hazard
 from pbfd_torch.models import Setup
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
@@ -61,6 +62,8 @@ class Result:
             "warm_started_steps": int((r.status == int(Status.WARM_STARTED)).sum()),
             "continued_steps": int((r.status == int(Status.CONTINUED)).sum()),
             "halved_steps": int((r.status == int(Status.HALVED)).sum()),
+            "candidates_dropped_steps": int((r.hazards & int(Hazard.CANDIDATES_DROPPED)).bool().sum()),
+            "moved_too_far_steps": int((r.hazards & int(Hazard.MOVED_TOO_FAR)).bool().sum()),
             "iterations_mean": float(iterations.mean()),
             "iterations_p95": float(iterations.sort().values[math.ceil(0.95 * len(iterations)) - 1]),
             "iterations_max": int(iterations.max()),

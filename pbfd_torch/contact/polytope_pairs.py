@@ -6,6 +6,7 @@ forms for boxes and from FCL for all others.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ class PolytopePairs:
     pair: `[m]` the number of each pair.
     first, second: `[m]` their colliders.
     body, frame: `[c]`, `[c, 4, 4]` the body of each collider, and where its shape is in it.
-    table, geometries: the shapes `[c]` as tensors, and as FCL's, which all worlds share; these may be empty where all are boxes.
+    polytopes, table: the shapes `[c]`, and as tensors.
     boxes: `[m]` bool, pairs of two boxes.
     broad_phase: what picks the pairs that are looked at.
     slots: how many candidates a world keeps.
@@ -44,8 +45,8 @@ class PolytopePairs:
     second: Tensor
     body: Tensor
     frame: Tensor
+    polytopes: Sequence[Polytope]
     table: PolytopeTable
-    geometries: Sequence[Any]
     boxes: Tensor
     broad_phase: BroadPhase
     slots: int
@@ -74,12 +75,20 @@ class PolytopePairs:
             second=second,
             body=index(bodies),
             frame=frames,
+            polytopes=tuple(polytopes),
             table=PolytopeTable.stack(polytopes).to(frames.dtype, device),
-            geometries=[] if all(boxes) else fcl_geometries(polytopes),
             boxes=torch.tensor(boxes, device=device),
             broad_phase=FclTree(first, second) if len(pairs) > MANY else AllPairs(first, second),
             slots=slots,
         )
+
+    @cached_property
+    def _geometries(self) -> list[Any]:
+        """FCL's shapes, which all worlds share; a copy in another process makes its own."""
+        return fcl_geometries(self.polytopes)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     @cached_property
     def _all_boxes(self) -> bool:
@@ -124,7 +133,7 @@ class PolytopePairs:
         return found, gap
 
     def _by_fcl(self, table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor) -> Any:
-        return fcl_separation(table, self.geometries, a, b, pose_a, pose_b)
+        return fcl_separation(table, self._geometries, a, b, pose_a, pose_b)
 
     def _slots(
         self,

@@ -234,24 +234,8 @@ class BodyContact:
             return (summed(back, moved - answer) - summed(there, answer + turned)).unflatten(-3, (links, links))
 
         moment = summed(on_second - on_first, outer(contact.force, extended(contact.at.points)))
-        return LinkLoad(moment, stiffness, coupling)
-
-    def outlook(self, prepared: PreparedBodyContact, motion: Motion) -> Callable[[Tensor], Tensor]:
-        """See `contact_outlook`; the motion is that of the first body as the second one sees it."""
-        slots, contact = prepared.slots, self.force(prepared, motion.placement)
-        at = contact.at
-        still = torch.zeros_like(prepared.obstacles[..., :3, :]).expand(*at.depth.shape[:-1], -1, -1, -1)
-
-        def of_slots(of_links: Tensor, body: Tensor) -> Tensor:
-            return _of_slots(torch.cat((of_links, still), -3), body)
-
-        first, second = ([of_slots(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
-        velocity = mapped(first[0] - second[0], at.centers)
-        carried = 2 * (second[0][..., :3] @ velocity[..., None]).squeeze(-1)  # Coriolis: seen from a turning body
-        acceleration = mapped(first[1] - second[1], at.centers) - carried
-        out = slots.radius[..., None] * at.normal
-        spin = first[0][..., :3] - second[0][..., :3]
-        return contact_outlook(contact, velocity - (spin @ out[..., None]).squeeze(-1), acceleration)
+        outlook = functools.partial(_outlook, slots, len(self.obstacles), contact)
+        return LinkLoad(moment, stiffness, coupling, outlook)
 
     def energy(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
         """As `Contact.energy`."""
@@ -280,6 +264,23 @@ class BodyContact:
 def _of_slots(bodies: Tensor, index: Tensor) -> Tensor:
     """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`."""
     return bodies[..., :3, :].take_along_dim(index[..., None, None].expand(*index.shape, 3, 4), -3)
+
+
+def _outlook(slots: Slots, obstacles: int, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
+    """See `contact_outlook`; the motion is that of the first body as the second one sees it."""
+    at = contact.at
+    still = motion.rates.new_zeros((*motion.rates.shape[:-3], obstacles, 3, 4))
+
+    def of_slots(of_links: Tensor, body: Tensor) -> Tensor:
+        return _of_slots(torch.cat((of_links, still), -3), body)
+
+    first, second = ([of_slots(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
+    velocity = mapped(first[0] - second[0], at.centers)
+    carried = 2 * (second[0][..., :3] @ velocity[..., None]).squeeze(-1)  # Coriolis: seen from a turning body
+    acceleration = mapped(first[1] - second[1], at.centers) - carried
+    out = slots.radius[..., None] * at.normal
+    spin = first[0][..., :3] - second[0][..., :3]
+    return contact_outlook(contact, velocity - (spin @ out[..., None]).squeeze(-1), acceleration)
 
 
 def _gaps(slots: Slots, bodies: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.grouping import Grouping
 from pbfd_torch.terms.inertia import inertia_stiffness
 from pbfd_torch.terms.lagged_friction import lagged_law, widened_law
-from pbfd_torch.terms.load import ForetellingLoad, StepContext
+from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.touching import ContactForce, Touching, arm, cross, extended, mapped, turned
@@ -245,7 +245,7 @@ class Contact:
             law = self.restitution.stiffened(law, prepared.bounce)
         return ContactForce(self.touching(prepared, placement), law, self.friction, prepared.dt, self.grip)
 
-    def load(self, prepared: PreparedContact, placement: Placement) -> ForetellingLoad:
+    def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         contact = self.force(prepared, placement)
         links, grouping = placement.poses.shape[-3], self._grouping
         at = contact.at
@@ -263,7 +263,8 @@ class Contact:
             return grouping.spread(summed, links)
 
         moment = -grouping.products(grouping.rows(contact.force), ends)
-        return ForetellingLoad(grouping.spread(moment, links), stiffness, functools.partial(self._outlook, contact))
+        outlook = functools.partial(self._outlook, contact)
+        return LinkLoad(grouping.spread(moment, links), stiffness, outlook=outlook)
 
     def _outlook(self, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
         velocity = self._grouping.mapped(motion.rates, self.position)

@@ -51,16 +51,25 @@ class StepContext:
 
 
 class LinkLoad:
-    """Loads on links, in world coordinates about the world origin. The stiffness is computed when first asked for.
+    """Loads on links, in world coordinates about the world origin. The matrices are computed when first asked for.
 
     moment: `[*batch, nlink, 3, 4]` [G | g] of METHOD §3: minus the first moment Σ f p̄ᵀ of the forces [N m | N]. coupled: whether
-    the wrench on one link answers the twist of another."""
+    the wrench on one link answers the twist of another. outlook: of forces that set in or change abruptly: takes a motion from the
+    load's placement to the work r·d [J] of its forces, d the motion's velocity, where links have moved to second order in the
+    length a: `[k, *batch] → [k, *batch]`; without it the load is taken to change linearly."""
 
-    def __init__(self, moment: Tensor, stiffness: Callable[[], Tensor], coupling: Callable[[], Tensor] | None = None) -> None:
+    def __init__(
+        self,
+        moment: Tensor,
+        stiffness: Callable[[], Tensor],
+        coupling: Callable[[], Tensor] | None = None,
+        outlook: Callable[[Motion], Callable[[Tensor], Tensor]] | None = None,
+    ) -> None:
         self.moment = moment
         self.coupled = coupling is not None
         self._stiffness = stiffness
         self._coupling = coupling
+        self.outlook = outlook
 
     @cached_property
     def stiffness(self) -> Tensor:
@@ -75,17 +84,6 @@ class LinkLoad:
             links = self.moment.shape[-3]
             return self.moment.new_zeros((*self.moment.shape[:-2], links, 6, 6))
         return self._coupling()
-
-
-class ForetellingLoad(LinkLoad):
-    """The load of a term that foretells, with what that needs already at hand. outlook: as in `Foretelling`, of a motion from the
-    load's placement."""
-
-    def __init__(
-        self, moment: Tensor, stiffness: Callable[[], Tensor], outlook: Callable[[Motion], Callable[[Tensor], Tensor]]
-    ) -> None:
-        super().__init__(moment, stiffness)
-        self.outlook = outlook
 
 
 class JointLoad:
@@ -118,17 +116,6 @@ class Term(Protocol):
 
     def take(self, worlds: Worlds) -> Self:
         """The same effect with the parameters of some worlds."""
-        ...
-
-
-@runtime_checkable
-class Foretelling(Protocol):
-    """A term on links whose forces set in or change abruptly, and that can tell where along a direction they do; if its load cannot
-    (`ForetellingLoad`)."""
-
-    def outlook(self, prepared: Any, motion: Motion) -> Callable[[Tensor], Tensor]:
-        """The work r·d [J] of its forces, d the motion's velocity, where links have moved to second order in the length a:
-        `[k, *batch] → [k, *batch]`."""
         ...
 
 

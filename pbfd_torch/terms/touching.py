@@ -1,7 +1,7 @@
 """The geometry and the forces of contact candidates at one placement, and how the forces answer a motion.
 
-A candidate is a centre c on a body, a radius ρ ≥ 0 and a margin δ ≥ 0, beside a solid with signed distance φ, whose gradient there has the direction n.
-Its depth is d = ρ + δ − φ(c), and its force acts at p = c − ρn. Over the step it slips by u = (1 − nnᵀ)m with
+A candidate is a centre c on a body, a radius ρ ≥ 0 and a margin δ ≥ 0, beside a solid with signed distance φ, whose gradient there
+has the direction n. Its depth is d = ρ + δ − φ(c), and its force acts at p = c − ρn. Over the step it slips by u = (1 − nnᵀ)m,
 m = c − c₀ − ρ ϕ × n + a (METHOD §4): c₀ is where the solid has carried the centre of the start, ϕ the rotation since then relative
 to the solid, and a what an anchor remembers. Everything is in world axes; what moves below is the body, relative to the solid.
 
