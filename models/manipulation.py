@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -67,7 +68,7 @@ def gripper(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.d
 def robot_arm(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
     """An arm of convex meshes sweeps a box, a stone and a can over a table; servos hold its joints, and turn it by 1.2 rad."""
     robot = load_robot(Path(__file__).parent / "arm.xml", dtype=dtype, device=device)
-    scene = robot_scene(robot)
+    scene = dataclasses.replace(robot_scene(robot), name="robot-arm")
     q = repeated(robot.articulation.rest, worlds)
     start = q.new_tensor([TURN, SHOULDER, ELBOW, WRIST])
     q[:, :4] = start

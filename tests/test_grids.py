@@ -294,6 +294,16 @@ def test_cache_is_used_repaired_and_not_required(cache: Path, tmp_path: Path, mo
     assert os.listdir(tmp_path / "xdg" / "pbfd_torch") == [file.name]
 
 
+def test_a_grid_reaches_as_far_as_it_is_asked_to() -> None:
+    """`reaching` widens the grid beyond the mesh, and is the mesh itself where it reaches far enough."""
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = Mesh(box.vertices, box.faces, cell=0.25)
+    assert mesh.reaching(0.5) is mesh
+    grid = mesh.reaching(1.0).surface()
+    assert float(grid.origin.max()) <= -1.5
+    assert float(grid.last.min()) >= 1.5
+
+
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "dae"])
 @pytest.mark.parametrize("scale", [0.5, (0.5, -0.5, 0.5)])
 def test_mesh_from_file(

@@ -32,8 +32,8 @@ class HalfSpace(Touchable):
         self.require_friction(f"'{self.name}'")
         object.__setattr__(self, "normal", tuple(x / length for x in self.normal))
 
-    def surface(self, dtype: torch.dtype, device: torch.device) -> Plane:
-        """Its signed distance, in world axes at time 0."""
+    def surface(self, dtype: torch.dtype, device: torch.device, reach: float = 0.0) -> Plane:
+        """Its signed distance, in world axes at time 0; right everywhere."""
         return Plane(torch.tensor(self.normal, dtype=dtype, device=device), torch.tensor([self.offset], dtype=dtype, device=device))
 
     def carrier(self, dtype: torch.dtype, device: torch.device) -> Carrier | None:

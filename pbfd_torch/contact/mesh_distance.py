@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 import os
@@ -92,14 +93,29 @@ class Mesh:
         $XDG_CACHE_HOME/pbfd_torch, else ~/.cache/pbfd_torch, where it can be written."""
         return DistanceGrid.through(self._distances, self._nodes.origin, self._nodes.cell, dtype, device)
 
+    def reaching(self, distance: float) -> Self:
+        """The same mesh with a grid that reaches `distance` [m] beyond it and two cells more, or itself where it does already: for
+        spheres of that radius."""
+        margin = distance + 2 * self._cell
+        return self if self._margin >= margin else dataclasses.replace(self, margin=margin)
+
+    @property
+    def _margin(self) -> float:
+        return 4 * self._cell if self.margin is None else self.margin
+
+    @cached_property
+    def _cell(self) -> float:
+        corners = self.vertices[self.faces]
+        return float((corners.max((0, 1)) - corners.min((0, 1))).max()) / 64 if self.cell is None else self.cell
+
     @cached_property
     def _nodes(self) -> Nodes:
         corners = self.vertices[self.faces]
         low, high = corners.min((0, 1)), corners.max((0, 1))
-        cell = float((high - low).max()) / 64 if self.cell is None else self.cell
+        cell = self._cell
         if not (math.isfinite(cell) and cell > 0):
             raise InputError(f"cell of a mesh is {cell} m: must be > 0 and finite")
-        margin = 4 * cell if self.margin is None else self.margin
+        margin = self._margin
         if not (math.isfinite(margin) and margin >= 2 * cell):
             raise InputError(f"margin of a mesh is {margin} m: must be finite and at least 2 cells, {2 * cell:.4g} m")
         count = np.ceil((high - low + 2 * margin) / cell - 1e-9) + 1

@@ -10,7 +10,7 @@ from torch import Tensor
 from pbfd_torch.articulation import homogeneous
 from pbfd_torch.contact.motion import Motion, Still
 from pbfd_torch.contact.pairing import Touchable
-from pbfd_torch.contact.shapes import Solid
+from pbfd_torch.contact.shapes import Nearby, Solid
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
 from pbfd_torch.rotations import quaternion_matrix
@@ -37,9 +37,10 @@ class Obstacle(Touchable):
         if not bool((torch.as_tensor(self.quaternion).abs().amax(-1) > 0).all()):
             raise InputError(f"quaternion of '{self.name}' is zero")
 
-    def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
-        """Its signed distance, in its own frame."""
-        return self.shape.surface(dtype, device)
+    def surface(self, dtype: torch.dtype, device: torch.device, reach: float = 0.0) -> Surface:
+        """Its signed distance, in its own frame, right up to `reach` [m] at least."""
+        shape = self.shape.reaching(reach) if isinstance(self.shape, Nearby) else self.shape
+        return shape.surface(dtype, device)
 
     def carrier(self, dtype: torch.dtype, device: torch.device) -> Carrier:
         """Where it is, for contact."""

@@ -41,6 +41,15 @@ class Solid(Protocol):
         ...
 
 
+@runtime_checkable
+class Nearby(Solid, Protocol):
+    """A solid whose signed distance is known only up to some distance from it."""
+
+    def reaching(self, distance: float) -> Solid:
+        """The same solid with a signed distance that is right up to `distance` [m] at least."""
+        ...
+
+
 def _require_positive(what: str, *values: float) -> None:
     if not all(math.isfinite(x) and x > 0 for x in values):
         raise InputError(f"{what} is {values if len(values) > 1 else values[0]}: must be > 0 and finite")

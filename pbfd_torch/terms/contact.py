@@ -116,6 +116,8 @@ class Contact:
         if not links:
             raise InputError(f"no collider can touch '{obstacle.name}': give at least one")
 
+        reach = float((np.concatenate(radii) + np.concatenate(margins)).max())
+
         def tensor(values: Any) -> Tensor:
             return torch.as_tensor(values, dtype=articulation.dtype, device=articulation.device)
 
@@ -124,7 +126,7 @@ class Contact:
             position=tensor(np.concatenate(centers)),
             radius=tensor(np.concatenate(radii)),
             margin=tensor(np.concatenate(margins)),
-            surface=obstacle.surface(articulation.dtype, articulation.device),
+            surface=obstacle.surface(articulation.dtype, articulation.device, reach),
             carrier=obstacle.carrier(articulation.dtype, articulation.device),
             normal_force=default_stiffness(articulation) if normal_force is None else normal_force,
             friction=friction,
