@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.candidates import Slots, nearest
 from pbfd_torch.contact.primitives import BoxSurface
-from pbfd_torch.contact.surface import Placed
+from pbfd_torch.contact.surface import Placed, Tangent
 from pbfd_torch.worlds import Worlds, replaced
 
 
@@ -44,8 +44,11 @@ class BallBoxPairs:
         centers = (first[..., :3] @ self.position[..., None]).squeeze(-1) + first[..., 3]
         seen = (second[..., :3].mT @ (centers - second[..., 3])[..., None]).squeeze(-1)
         gap = self._box(torch.arange(len(self.pair), device=self.pair.device)).field(seen).distance - self.radius
-        near = gap < reach[..., self.first] + reach[..., self.second]
-        which, filled, dropped = nearest(gap, near, self.slots)
+        moves = reach[..., self.first] + reach[..., self.second]
+        which, filled, dropped = nearest(gap, gap < moves, self.slots)
+        thickness = 2 * self.half_extents.amin(-1)[which]
+        seen = seen.take_along_dim(which[..., None].expand(*which.shape, 3), -2)
+        surface = Tangent.before(self._box(which), seen, moves.gather(-1, which), thickness)
         return Slots(
             filled=filled,
             pair=self.pair[which],
@@ -53,7 +56,7 @@ class BallBoxPairs:
             position=self.position[which],
             radius=self.radius[which],
             second=self.second[which],
-            surface=self._box(which),
+            surface=surface,
             dropped=dropped,
         )
 

@@ -36,6 +36,11 @@ class HalfSpace(Touchable):
         """Its signed distance, in world axes at time 0; right everywhere."""
         return Plane(torch.tensor(self.normal, dtype=dtype, device=device), torch.tensor([self.offset], dtype=dtype, device=device))
 
+    @property
+    def thickness(self) -> float:
+        """Endless."""
+        return math.inf
+
     def carrier(self, dtype: torch.dtype, device: torch.device) -> Carrier | None:
         """What moves it, or None."""
         if not self.motion.moves and not any(self.motion.belt):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 from pbfd_torch.articulation import homogeneous
 from pbfd_torch.contact.motion import Motion, Still
 from pbfd_torch.contact.pairing import Touchable
-from pbfd_torch.contact.shapes import Nearby, Solid
+from pbfd_torch.contact.polytope import thickness_of
+from pbfd_torch.contact.shapes import Nearby, Shape, Solid
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
 from pbfd_torch.rotations import quaternion_matrix
@@ -41,6 +43,11 @@ class Obstacle(Touchable):
         """Its signed distance, in its own frame, right up to `reach` [m] at least."""
         shape = self.shape.reaching(reach) if isinstance(self.shape, Nearby) else self.shape
         return shape.surface(dtype, device)
+
+    @property
+    def thickness(self) -> float:
+        """Of a convex solid [m]; infinite for others, which have no one side to be kept on."""
+        return thickness_of(self.shape) if isinstance(self.shape, Shape) else math.inf
 
     def carrier(self, dtype: torch.dtype, device: torch.device) -> Carrier:
         """Where it is, for contact."""

@@ -63,6 +63,13 @@ def polytope_of(shape: Shape) -> Polytope:
     return Polytope(vertices, planes, polygons, edges, radius)
 
 
+def thickness_of(shape: Shape) -> float:
+    """The least distance [m] between two parallel planes that hold a convex shape between them."""
+    polytope = polytope_of(shape)
+    along = polytope.vertices @ polytope.planes[:, :3].T
+    return float(np.ptp(along, axis=0).min(initial=np.inf if len(polytope.vertices) > 2 else 0.0)) + 2 * polytope.radius
+
+
 def _hull(points: Points) -> tuple[Points, list[Indices]]:
     """Vertices of the convex hull of points, and the ordered vertices of each face."""
     from scipy.spatial import ConvexHull

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.candidates import Slots, nearest
 from pbfd_torch.contact.primitives import SegmentSurface, dot
+from pbfd_torch.contact.surface import Tangent
 from pbfd_torch.worlds import Worlds, replaced
 
 
@@ -72,14 +73,19 @@ class RoundPairs:
         along = _places(a, b, c, d)  # [*, m, 3]
         centers = a[..., None, :] + along[..., None] * (b - a)[..., None, :]
         gap = _distance(centers, c[..., None, :], d[..., None, :]) - self.radii.sum(-1)[:, None]
-        near = gap < (reach[..., self.first] + reach[..., self.second])[..., None]
+        moves = (reach[..., self.first] + reach[..., self.second])[..., None]
+        near = gap < moves
         long = (self.axes[:, 0] != self.axes[:, 1]).any(-1)[:, None]
         near = near & (long | (torch.arange(3, device=near.device) == 0))
         order, filled, dropped = nearest(gap.flatten(-2), near.flatten(-2), self.slots)
         which = order // 3
         share = along.flatten(-2).gather(-1, order)[..., None]
         axis = self.axes[which]
-        surface = replaced(_TEMPLATE, start=axis[..., 2, :], end=axis[..., 3, :], radius=self.radii[which][..., 1])
+        solid = replaced(_TEMPLATE, start=axis[..., 2, :], end=axis[..., 3, :], radius=self.radii[which][..., 1])
+        second = bodies[..., self.second, :3, :]
+        seen = (second[..., None, :, :3].mT @ (centers - second[..., None, :, 3])[..., None]).squeeze(-1)
+        seen = seen.flatten(-3, -2).take_along_dim(order[..., None].expand(*order.shape, 3), -2)
+        surface = Tangent.before(solid, seen, moves.squeeze(-1).gather(-1, which), 2 * self.radii[which][..., 1])
         return Slots(
             filled=filled,
             pair=self.pair[which],

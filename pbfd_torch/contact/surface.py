@@ -104,3 +104,42 @@ class Placed:
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
         return replaced(self, solid=self.solid.take(worlds), frame=worlds.pick(self.frame, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """A convex solid, or for the points `where` `[*batch, n]` the half-space behind a plane that touches it. A point that moves far
+    in one step ends beyond the solid, where its own distance knows nothing of what lies between; the plane does.
+
+    normal, offset: of the planes, `[*batch, n, 3]` and `[*batch, n]` [m]."""
+
+    solid: Surface
+    where: Tensor
+    normal: Tensor
+    offset: Tensor
+
+    @staticmethod
+    def before(solid: Surface, points: Tensor, moves: Tensor, thickness: float | Tensor) -> Tangent:
+        """The planes nearest to points `[*batch, n, 3]` outside the solid, which may move so far `[*batch, n]` [m] that they come
+        past the middle of its `thickness` [m]."""
+        start = solid.field(points)
+        normal = start.direction
+        past = (start.distance > 0) & (moves > start.distance + 0.5 * thickness)
+        return Tangent(solid, past, normal, (points * normal).sum(-1) - start.distance)
+
+    def field(self, points: Tensor) -> Field:
+        """See `Surface`."""
+        own, where = self.solid.field(points), self.where[..., None]
+        distance = torch.where(self.where, (points * self.normal).sum(-1) - self.offset, own.distance)
+        normal = torch.where(where, self.normal, own.direction)
+        return Field(distance, normal, lambda: torch.where(where[..., None], 0.0, own.bend))
+
+    def take(self, worlds: Worlds) -> Self:
+        """See `Surface`."""
+        return replaced(
+            self,
+            solid=self.solid.take(worlds),
+            where=worlds.pick(self.where, 1),
+            normal=worlds.pick(self.normal, 2),
+            offset=worlds.pick(self.offset, 1),
+        )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,7 @@ from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Carrier, Obstacle
 from pbfd_torch.contact.shapes import Collider
-from pbfd_torch.contact.surface import Surface
+from pbfd_torch.contact.surface import Surface, Tangent
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.rotations import quaternion_matrix, rotation_log
@@ -44,6 +45,7 @@ class PreparedContact:
     rotations: Tensor  # [*batch, nlink, 3, 3] the links' at the start, carried likewise
     frame: Tensor | None  # [*batch, 1, 3, 4] the solid's at the end of the step; None: the world's
     anchor: Tensor | None  # [*batch, npoint, 3] what the anchors are behind by, in world axes at the end of the step
+    surface: Surface  # the solid, or what stands for it in this step
     bounce: Tensor | None  # [*batch, npoint] how far the surface is moved out to throw a candidate back
 
 
@@ -76,6 +78,7 @@ class Contact:
         friction: the tangential law, or None for a frictionless contact.
         grip: what the law is multiplied by, `[npoint]`: the μ of every candidate for a law whose own is 1; None: 1.
         restitution: how much of the speed of an impact comes back; None: nothing.
+        thickness: of a convex solid [m]; candidates that may come past its middle in one step meet its tangent plane instead.
         names: the collider that each candidate belongs to.
     """
 
@@ -89,6 +92,7 @@ class Contact:
     friction: FrictionLaw | None
     grip: Tensor | None = None
     restitution: Restitution | None = None
+    thickness: float = math.inf
     names: tuple[str, ...] = ()
 
     @staticmethod
@@ -131,6 +135,7 @@ class Contact:
             normal_force=default_stiffness(articulation) if normal_force is None else normal_force,
             friction=friction,
             restitution=restitution,
+            thickness=obstacle.thickness,
             names=tuple(names),
         )
 
@@ -190,10 +195,16 @@ class Contact:
         anchor = None
         if isinstance(self.friction, AnchoredFriction):
             anchor = memory if frame is None else turned(frame[..., :3], memory)
-        prepared = PreparedContact(dt, centers, rotations, frame, anchor, None)
-        if self.restitution is None:
+        prepared = PreparedContact(dt, centers, rotations, frame, anchor, self.surface, None)
+        if self.restitution is None and math.isinf(self.thickness):
             return prepared
         free = self._grouping.mapped(step.target_poses, self.position)
+        if math.isfinite(self.thickness):
+            moves = torch.linalg.vector_norm(free - centers, dim=-1)
+            tangent = Tangent.before(self.surface, _seen(frame, centers), moves, self.thickness)
+            prepared = dataclasses.replace(prepared, surface=tangent)
+        if self.restitution is None:
+            return prepared
         coasting = self._centers(place(step.previous.articulation, step.target_q))
         gaps = [-self._at(prepared, points, None).depth for points in (centers, free, coasting)]
         return dataclasses.replace(prepared, bounce=self.restitution.bounce(gaps[0], gaps[1], dt, gaps[2]))
@@ -219,8 +230,7 @@ class Contact:
 
     def _at(self, prepared: PreparedContact, centers: Tensor, turn: Tensor | None) -> Touching:
         frame = prepared.frame
-        here = centers if frame is None else turned(frame[..., :3].mT, centers - frame[..., 3])
-        field = self.surface.field(here)
+        field = prepared.surface.field(_seen(frame, centers))
         normal, bend = field.direction, None if field.flat else lambda: field.bend
         if frame is not None:
             normal = turned(frame[..., :3], normal)
@@ -285,7 +295,7 @@ class Contact:
         if self.carrier is not None:
             frame = self.carrier.pose(centers.new_zeros(()) if time is None else time)[..., None, :3, :]
         none = centers.new_zeros(())
-        return self._at(PreparedContact(none, none, none, frame, None, None), centers, None).depth
+        return self._at(PreparedContact(none, none, none, frame, None, self.surface, None), centers, None).depth
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
@@ -320,3 +330,8 @@ class Contact:
         contact = self.force(prepared, placement)
         at = contact.at
         return ContactPoints(at.points, at.depth, at.normal, contact.force, at.slip)
+
+
+def _seen(frame: Tensor | None, points: Tensor) -> Tensor:
+    """World points in a frame `[*batch, 1, 3, 4]`, or themselves."""
+    return points if frame is None else turned(frame[..., :3].mT, points - frame[..., 3])
