@@ -1,0 +1,88 @@
+"""Fast bodies and thin solids: nothing convex is jumped."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.height_field import HeightField
+from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.polytope import thickness_of
+from pbfd_torch.contact.primitives import BoxSurface
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Shape, Sphere
+from pbfd_torch.contact.surface import Tangent
+from pbfd_torch.models.stacks import solid_box
+from pbfd_torch.simulator import Scene
+from pbfd_torch.terms.contact_terms import contact_terms
+from pbfd_torch.terms.inertia import Inertia
+from tests.bodies import rolled_out
+from tests.finite_differences import derivative, relative_error
+from tests.random_trees import generator
+
+PLATE = (1.0, 1.0, 0.005)  # half extents [m]: 1 cm thick
+SHEET = ConvexHull(np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]))
+
+
+@pytest.mark.parametrize(("speed", "dt"), [(20.0, 0.02), (20.0, 0.1), (100.0, 0.1)])
+@pytest.mark.parametrize("shape", [Sphere(0.05), Box((0.05, 0.05, 0.05)), Capsule(0.02, 0.05)], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("plate", ["obstacle", "link"])
+def test_a_plate_stops_what_would_jump_it(plate: str, shape: Shape, speed: float, dt: float) -> None:
+    """A body that covers .4 to 10 m in a step ends on its own side of a plate of 1 cm, a fixed one or one of 1000 kg that floats;
+    every step is solved, and there is no hazard to tell of."""
+    links, colliders = [solid_box("body", (0.05, 0.05, 0.05), 1.0)], [Collider("body", "body", shape)]
+    obstacles = [Obstacle("plate", Box(PLATE))] if plate == "obstacle" else []
+    if plate == "link":
+        links.append(solid_box("plate", PLATE, 1000.0))
+        colliders.append(Collider("plate", "plate", Box(PLATE)))
+    articulation = Articulation.from_links(links)
+    still = torch.zeros(3, dtype=torch.float64)
+    scene = Scene(articulation, (Inertia(), *contact_terms(articulation, colliders, obstacles)), still)
+    q, v = articulation.rest[None].clone(), torch.zeros(1, articulation.nv, dtype=torch.float64)
+    q[0, 2], v[0, 2] = 0.5, -speed
+    rollout = rolled_out(scene, dt, dt * (3 + math.ceil(1 / (speed * dt))), q, v)
+    beside = rollout.q[:, 0, 2] - (rollout.q[:, 0, 9] if plate == "link" else 0.0)
+    assert float(beside.min()) > 0
+    assert float(rollout.v[-1, 0, 2]) > -0.1 * speed
+    assert bool(rollout.solved.all())
+    assert int(rollout.hazards.abs().max()) == 0
+
+
+def test_tangent_planes_stand_in_for_what_is_passed() -> None:
+    """Where a point may come past the middle, the field is the plane that touches the box nearest to it, else the box's own; its
+    normal and curvature are the derivatives of both."""
+    box = BoxSurface(torch.tensor([[0.3, 0.2, 0.1]], dtype=torch.float64))
+    random = generator(3)
+    start = 2 * torch.rand(200, 3, dtype=torch.float64, generator=random) - 1
+    moves = torch.rand(200, dtype=torch.float64, generator=random)
+    tangent = Tangent.before(box, start, moves, 0.2)
+    distance = box.field(start).distance
+    assert torch.equal(tangent.where, (distance > 0) & (moves > distance + 0.1))
+    assert 20 < int(tangent.where.sum()) < 180
+    assert float((tangent.field(start).distance - distance).abs().max()) <= 1e-15
+    there = start + 0.3 * torch.randn(200, 3, dtype=torch.float64, generator=random)
+    field = tangent.field(there)
+    own = ~tangent.where
+    assert torch.equal(field.distance[own], box.field(there).distance[own])
+    outside = (box.field(there).distance > 1e-3) | tangent.where
+    slope = derivative(lambda d: tangent.field(there + d).distance, 3, (200,), largest=1e-4)
+    assert relative_error(field.normal[outside][..., None], slope[outside][..., None]) <= 1e-7
+    assert bool((field.curvature[tangent.where] == 0).all())
+    assert torch.equal(field.curvature[own], box.field(there).curvature[own])
+
+
+def test_thickness() -> None:
+    """The least width of convex solids, also of one that is turned in its frame; half-spaces and terrains have no other side."""
+    corner = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])  # between the slanted face and the corner: 1/√3
+    assert thickness_of(ConvexHull(corner)) == pytest.approx(1 / math.sqrt(3), rel=1e-12)
+    assert thickness_of(Box((0.3, 0.2, 0.1))) == pytest.approx(0.2)
+    assert thickness_of(Sphere(0.1)) == pytest.approx(0.2)
+    assert thickness_of(Capsule(0.1, 0.5)) == pytest.approx(0.2)
+    assert thickness_of(Cylinder(0.4, 0.05)) == pytest.approx(0.1)
+    assert thickness_of(SHEET) == 0
+    assert math.isinf(HalfSpace().thickness)
+    assert math.isinf(Obstacle("hills", HeightField(np.zeros((4, 4)), (1.0, 1.0))).thickness)
