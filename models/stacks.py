@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -14,6 +15,7 @@ from pbfd_torch.contact.shapes import Box, Collider, ConvexHull, Shape
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Scene
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
@@ -41,14 +43,14 @@ def _moved(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
 
 
 def _resting(
-    title: str, links: Sequence[Link], shapes: Sequence[Shape], q: Sequence[float], worlds: int, mu: float, stiffness: float,
+    title: str, links: Sequence[Link], shapes: Sequence[Shape], q: Sequence[float], worlds: int, mu: float, rules: ContactRules,
     dtype: torch.dtype, device: torch.device | str,
 ) -> Setup:  # fmt: skip
     """Free bodies with one shape each on level ground, at rest in `q`."""
     articulation = Articulation.from_links(links, dtype, device)
     colliders = [Collider(link.name, link.name, shape, friction=mu) for link, shape in zip(links, shapes, strict=True)]
     ground = HalfSpace(friction=mu)
-    terms = contact_terms(articulation, colliders, (ground,), ContactRules(NormalForce(stiffness), slots=16 * len(links)))
+    terms = contact_terms(articulation, colliders, (ground,), dataclasses.replace(rules, slots=16 * len(links)))
     gravity = torch.tensor([0.0, 0.0, -GRAVITY], dtype=dtype, device=device)
     scene = Scene(articulation, (Inertia(), *terms), gravity, colliders, (ground,), title)
     start = repeated(torch.tensor(q, dtype=dtype, device=device), worlds)
@@ -64,7 +66,7 @@ def _stack(count: int, worlds: int, dtype: torch.dtype, device: torch.device | s
         height += HALF[2]
     links = [solid_box(f"box{k}", HALF, 1.0) for k in range(count)]
     title = "stack" if count == 5 else f"stack-{count}"
-    return _resting(title, links, [Box(HALF)] * count, q, worlds, FRICTION, STIFFNESS, dtype, device)
+    return _resting(title, links, [Box(HALF)] * count, q, worlds, FRICTION, ContactRules(NormalForce(STIFFNESS)), dtype, device)
 
 
 def stack(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
@@ -84,7 +86,8 @@ def heavy_on_light(worlds: int = 1, dtype: torch.dtype = torch.float64, device: 
     low, up = (math.sqrt(GRAVITY * m / 4 / stiffness) for m in (1001, 1000))
     q = [0.0, 0.0, 0.05 - low, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.6 - low - up, 1.0, 0.0, 0.0, 0.0]
     links = [solid_box("light", light, 1.0), solid_box("heavy", heavy, 1000.0)]
-    return _resting("heavy-on-light", links, [Box(light), Box(heavy)], q, worlds, FRICTION, stiffness, dtype, device)
+    rules = ContactRules(NormalForce(stiffness))
+    return _resting("heavy-on-light", links, [Box(light), Box(heavy)], q, worlds, FRICTION, rules, dtype, device)
 
 
 def _wedge(angle: float) -> tuple[ConvexHull, float, tuple[float, float, float]]:
@@ -105,7 +108,8 @@ def _wedge(angle: float) -> tuple[ConvexHull, float, tuple[float, float, float]]
 
 
 def arch(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
-    """A half circle of eleven loose stones, 10 kg each, that stands by itself, μ = .7: each rests on its neighbours only."""
+    """A half circle of eleven loose stones, 10 kg each, that stands by itself, μ = .7 with anchors: each rests on its neighbours
+    only, and would creep by half a millimetre a second without."""
     angle = math.pi / STONES
     shape, height, (x, y, z) = _wedge(angle)
     rows = ((10 * x, 0.0, 0.0), (0.0, 10 * y, 0.0), (0.0, 0.0, 10 * z))
@@ -115,4 +119,5 @@ def arch(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.devi
     for k in range(STONES):
         turn = (k + 0.5) * angle - math.pi / 2  # from the left foot over the top to the right one
         q += [height * math.sin(turn), 0.0, height * math.cos(turn), math.cos(turn / 2), 0.0, math.sin(turn / 2), 0.0]
-    return _resting("arch", links, [shape] * STONES, q, worlds, ARCH_FRICTION, 1e9, dtype, device)
+    rules = ContactRules(NormalForce(1e9), AnchoredFriction(1.0))
+    return _resting("arch", links, [shape] * STONES, q, worlds, ARCH_FRICTION, rules, dtype, device)

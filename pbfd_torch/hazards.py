@@ -10,6 +10,7 @@ class Hazard(enum.IntFlag):
 
     CANDIDATES_DROPPED = 1  # more was near than there are slots for: contacts may be missing
     MOVED_TOO_FAR = 2  # a body moved further than detection looked: it may have jumped over something
+    OVERLAPPED = 4  # bodies overlapped by more than the slack at its start: they began so, or turned into each other before
 
 
 class Overflow(enum.Enum):

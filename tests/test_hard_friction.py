@@ -26,12 +26,16 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.bodies import GRAVITY, at, down, rises, rolled_out
+from tests.touching_bodies import stored
 
 HALF = (0.1, 0.1, 0.02)  # half extents of the sliding box [m], flat enough not to tip
 SLIP_SPEED = 1e-3  # ε_v [m/s]
 STIFFNESS = 1e8
 TABLE = Obstacle("table", Box((30.0, 3.0, 0.1)), (0.0, 0.0, -0.1))
-GROUNDS = {"half-space": HalfSpace(), "box": TABLE}  # candidate points of the box; contacts detected between two boxes
+GROUNDS: dict[str, HalfSpace | Obstacle] = {
+    "half-space": HalfSpace(),
+    "box": TABLE,
+}  # candidate points of the box; contacts detected between two boxes
 MU = torch.tensor([0.1, 0.2, 0.3, 0.5, 0.8], dtype=torch.float64)
 
 
@@ -87,7 +91,8 @@ def test_edge_of_the_cone(dt: float) -> None:
 
 @pytest.mark.parametrize("dt", [0.01, 0.05])
 def test_ramp_grid(dt: float) -> None:
-    """The scene's 25 ramps: where μ > tan of the slope a box creeps slower than ε_v; elsewhere it gains g (sin − μ cos), to 1 %."""
+    """The scene's 25 ramps: where μ > tan of the slope a box that has settled creeps slower than ε_v; elsewhere it gains
+    g (sin − μ cos), to 1 %."""
     setup = ramp_grid()
     rollout = run(setup, dt, 0.5)
     place, half = rollout.link_poses[:, 0, :, :, 3], rollout.steps // 2
@@ -95,19 +100,19 @@ def test_ramp_grid(dt: float) -> None:
     slope = torch.deg2rad(torch.tensor(RAMPS, dtype=torch.float64)).repeat_interleave(5)
     mu = torch.tensor(RAMP_FRICTION, dtype=torch.float64).repeat(5)
     exact = GRAVITY * (torch.sin(slope) - mu * torch.cos(slope))
-    assert float(speed[:, exact < 0].max()) < SLIP_SPEED
+    assert float(speed[half:, exact < 0].max()) < SLIP_SPEED
     gained = (speed[-1] - speed[half]) / float(rollout.time[-1] - rollout.time[half + 1])
     torch.testing.assert_close(gained[exact > 0], exact[exact > 0], rtol=0.01, atol=0)
 
 
-@pytest.mark.parametrize("ground", GROUNDS)
-def test_critical_slope(ground: str) -> None:
-    """tan = .5, 25 s at Δt .025: with μ = .49 the box slides ½ g (sin − μ cos) T², to 1 %; with μ = .5, the cone itself, it goes no
-    faster than ε_v, and with an anchor it gives way by a few stretches."""
+@pytest.mark.parametrize(("ground", "dt"), [("half-space", 0.025), ("box", 0.1)])
+def test_critical_slope(ground: str, dt: float) -> None:
+    """tan = .5, 25 s: with μ = .49 the box slides ½ g (sin − μ cos) T², to 1 %; with μ = .5, the cone itself, it goes no faster
+    than ε_v."""
     slope = torch.full((2,), math.atan(0.5), dtype=torch.float64)
     mu = torch.tensor([[0.49], [0.5]], dtype=torch.float64)
     scene, q = sliding(ground, CoulombFriction(mu, SLIP_SPEED), slope)
-    rollout = rolled_out(scene, 0.025, 25.0, q)
+    rollout = rolled_out(scene, dt, 25.0, q)
     sound(rollout)
     slid, held = (rollout.q[-1, :, 0] - rollout.q[0, :, 0]).tolist()
     assert slid == pytest.approx(0.5 * GRAVITY * 0.01 * math.cos(math.atan(0.5)) * 25.0**2, rel=0.01)
@@ -151,7 +156,8 @@ def test_stopping_distance(ground: str, dt: float, tolerance: float) -> None:
     assert int(slow.sum()) >= 9
     assert float(error[slow].abs().max()) <= tolerance
     assert float(rollout.v[-1].abs().max()) < 1e-3
-    assert rises(rollout.energy) <= 1e-9
+    energy = rollout.energy[1:] + stored(rollout, 0 if ground == "box" else 8)
+    assert rises(energy) <= 1e-9
 
 
 # Grounds that move ----------------------------------------------------------------------------------------------------

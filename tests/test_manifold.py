@@ -90,7 +90,7 @@ def find(shapes: tuple[Shape, ...], a: Tensor, b: Tensor, pose_a: Tensor, pose_b
     polytopes = [polytope_of(shape) for shape in shapes]
     table = PolytopeTable.stack(polytopes).to(pose_a.dtype)
     separation = fcl_separation(table, fcl_geometries(polytopes), a, b, pose_a, pose_b)
-    found = manifold(table, a, b, pose_a, pose_b, separation.normal, most)
+    found = manifold(table, a, b, pose_a, pose_b, separation.normal, torch.zeros_like(a) > 0, most)
     swap = found.swapped[:, None, None]
     carrier, base = torch.where(swap, pose_b, pose_a), torch.where(swap, pose_a, pose_b)
     points = found.point @ carrier[:, :3, :3].mT + carrier[:, None, :3, 3]
@@ -368,7 +368,7 @@ def test_gradients_are_finite_and_those_of_differences() -> None:
     def gaps(turn: Tensor) -> Tensor:
         at = torch.cat((quaternion_matrix(quaternion_exp(turn)), turn.new_tensor([[0.1], [0.2], [0.999]])), 1)[None]
         separation = box_separation(table, zero, zero, at, below)
-        found = manifold(table, zero, zero, at, below, separation.normal)
+        found = manifold(table, zero, zero, at, below, separation.normal, zero > 0)
         return torch.cat((found.point.flatten(), found.offset, separation.along))
 
     generic = torch.tensor([0.02, 0.03, 0.4], dtype=F64, requires_grad=True)

@@ -64,6 +64,7 @@ class Result:
             "halved_steps": int((r.status == int(Status.HALVED)).sum()),
             "candidates_dropped_steps": int((r.hazards & int(Hazard.CANDIDATES_DROPPED)).bool().sum()),
             "moved_too_far_steps": int((r.hazards & int(Hazard.MOVED_TOO_FAR)).bool().sum()),
+            "overlapped_steps": int((r.hazards & int(Hazard.OVERLAPPED)).bool().sum()),
             "iterations_mean": float(iterations.mean()),
             "iterations_p95": float(iterations.sort().values[math.ceil(0.95 * len(iterations)) - 1]),
             "iterations_max": int(iterations.max()),

@@ -53,12 +53,14 @@ class Manifold:
     mask: Tensor
 
 
-def manifold(table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor, normal: Tensor, most: int = 8) -> Manifold:
+def manifold(
+    table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor, normal: Tensor, whole: Tensor, most: int = 8
+) -> Manifold:
     """Contact points of pairs. Its cost goes with the table's largest polytope: keep large hulls in a table of their own.
 
     table: the shapes; a, b: `[K]` rows of it; pose_a, pose_b: `[K, 3 or 4, 4]` of the shapes in the world; normal: `[K, 3]` unit,
-    world, direction of separation from b to a (see `Separation`); most: points per pair, ≥ 1. Raises `InputError` where it is
-    not."""
+    world, direction of separation from b to a (see `Separation`); whole: `[K]` bool, pairs of which all corners of the incident
+    body count, not those of the overlap alone; most: points per pair, ≥ 1. Raises `InputError` where it is not."""
     if most < 1:
         raise InputError(f"most is {most}: must be ≥ 1 point per pair")
     aligned_a, face_a = _aligned(table, a, pose_a, -normal)
@@ -89,8 +91,9 @@ def manifold(table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b:
         _support_edge(table.vertices[reference], table.edges[reference], -n),
         _support_edge(vertices, table.edges[incident], n),
     )
-    points = torch.cat((on_face, on_edge), 1)
-    valid = torch.cat((inside & by_face[:, None], met & ~by_face[:, None]), 1)
+    points = torch.cat((on_face, on_edge, vertices), 1)
+    all_corners = whole[:, None].expand(vertices.shape[:2])
+    valid = torch.cat((inside & by_face[:, None], met & ~by_face[:, None], all_corners), 1)
     points, mask = _spread(points, valid, _dot(points, n[:, None]), most, merged)
     turn = rotation.mT[:, None]
     return Manifold(

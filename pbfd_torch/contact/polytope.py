@@ -43,6 +43,12 @@ class Polytope:
     edges: Indices
     radius: float
 
+    @property
+    def thickness(self) -> float:
+        """The least distance [m] between two parallel planes that hold the rounded polytope between them."""
+        along = self.vertices @ self.planes[:, :3].T
+        return float(np.ptp(along, axis=0).min(initial=np.inf if len(self.vertices) > 2 else 0.0)) + 2 * self.radius
+
 
 def polytope_of(shape: Shape) -> Polytope:
     """The hull of the candidate points of a shape, rounded by their radius. Raises `InputError` where there is no candidate, one
@@ -65,9 +71,7 @@ def polytope_of(shape: Shape) -> Polytope:
 
 def thickness_of(shape: Shape) -> float:
     """The least distance [m] between two parallel planes that hold a convex shape between them."""
-    polytope = polytope_of(shape)
-    along = polytope.vertices @ polytope.planes[:, :3].T
-    return float(np.ptp(along, axis=0).min(initial=np.inf if len(polytope.vertices) > 2 else 0.0)) + 2 * polytope.radius
+    return polytope_of(shape).thickness
 
 
 def _hull(points: Points) -> tuple[Points, list[Indices]]:

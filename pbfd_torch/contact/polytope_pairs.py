@@ -104,27 +104,38 @@ class PolytopePairs:
         near = self.broad_phase.near(vertices.amin(-2) - room, vertices.amax(-2) + room)
         world, row = near.reshape(-1, len(self.pair)).nonzero().unbind(-1)
         poses, reach = poses.flatten(0, -4) if batch else poses[None], reach.reshape(-1, reach.shape[-1])
-        found, gap = self._manifolds(poses, world, row)
         a, b = self.first[row], self.second[row]
+        moves = reach[world, self.body[a]] + reach[world, self.body[b]]
+        found, gap = self._manifolds(poses, world, row, moves)
         points = torch.where(found.swapped, b, a)
         plane = torch.where(found.swapped, a, b)
-        within = found.mask & (gap < (reach[world, self.body[a]] + reach[world, self.body[b]])[:, None])
+        within = found.mask & (gap < moves[:, None])
         return self._slots(batch, world, row, found, points, plane, gap, within)
 
-    def _manifolds(self, poses: Tensor, world: Tensor, row: Tensor) -> tuple[Manifold, Tensor]:
-        """Contact points of pairs `row` `[k]` in worlds `[k]`, and the gap of each `[k, POINTS]`."""
+    @cached_property
+    def _middle(self) -> Tensor:
+        """`[m]` half the thickness of the thinner one of each pair [m]."""
+        thickness = self.frame.new_tensor([x.thickness for x in self.polytopes])
+        return 0.5 * torch.minimum(thickness[self.first], thickness[self.second])
+
+    def _manifolds(self, poses: Tensor, world: Tensor, row: Tensor, moves: Tensor) -> tuple[Manifold, Tensor]:
+        """Contact points of pairs `row` `[k]` in worlds `[k]` that move so far `[k]` [m], and the gap of each `[k, POINTS]`."""
         a, b = self.first[row], self.second[row]
         pose_a, pose_b = poses[world, a], poses[world, b]
         boxes = self.boxes[row]
         if self._all_boxes:
-            normal = box_separation(self.table, a, b, pose_a, pose_b).normal
+            apart = box_separation(self.table, a, b, pose_a, pose_b)
+            normal, distance = apart.normal, apart.distance
         else:
-            normal = torch.empty_like(pose_a[:, :3, 3])
+            normal, distance = torch.empty_like(pose_a[:, :3, 3]), torch.empty_like(pose_a[:, 0, 0])
             for which, separation in ((boxes, box_separation), (~boxes, self._by_fcl)):
                 some = which.nonzero().squeeze(-1)
                 if len(some):
-                    normal[some] = separation(self.table, a[some], b[some], pose_a[some], pose_b[some]).normal
-        found = manifold(self.table, a, b, pose_a, pose_b, normal, POINTS)
+                    apart = separation(self.table, a[some], b[some], pose_a[some], pose_b[some])
+                    normal[some], distance[some] = apart.normal, apart.distance
+        # apart, and perhaps past the middle of the thinner one at the end: whatever corner turns round meets the plane as well
+        whole = (distance > self._middle[row]) & (moves > distance + self._middle[row])
+        found = manifold(self.table, a, b, pose_a, pose_b, normal, whole, POINTS)
         swapped = found.swapped[:, None, None]
         points, plane = torch.where(swapped, pose_b, pose_a), torch.where(swapped, pose_a, pose_b)
         place = rotated(points[:, None, :3, :3], found.point) + points[:, None, :3, 3]

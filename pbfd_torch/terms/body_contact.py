@@ -65,7 +65,8 @@ class BodyContact:
         friction: the tangential law for μ = 1, or None; `grip`: `[npair]` the μ of every pair of colliders.
         restitution: how much of the speed of an impact comes back; None: nothing.
         overflow: what to do where more is near than there are slots.
-        slack: [m] how much further than its free motion and half as far again a body may go without a candidate being missed.
+        slack: [m] how much further than its free motion and half as far again a body may go without a candidate being missed, and
+            how far bodies may overlap at the start of a step without a `Hazard`.
     """
 
     finder: Finder
@@ -162,8 +163,10 @@ class BodyContact:
         """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
         after = torch.cat((placement.poses, prepared.obstacles), -3)
         far = (self._travel(prepared.bodies, after) > prepared.reach).any(-1)
-        bits = prepared.slots.dropped.to(torch.int32) * int(Hazard.CANDIDATES_DROPPED)
-        return bits + far.to(torch.int32) * int(Hazard.MOVED_TOO_FAR)
+        slots = prepared.slots
+        overlapped = (slots.filled & (_gaps(slots, prepared.bodies) < -self.slack)).any(-1)
+        found = {Hazard.CANDIDATES_DROPPED: slots.dropped, Hazard.MOVED_TOO_FAR: far, Hazard.OVERLAPPED: overlapped}
+        return torch.stack([where.to(torch.int32) * int(bit) for bit, where in found.items()]).sum(0, dtype=torch.int32)
 
     def remembered(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
         """What the anchors know after a step that ended at a placement; see `memory`."""
@@ -262,8 +265,10 @@ class BodyContact:
 
 
 def _of_slots(bodies: Tensor, index: Tensor) -> Tensor:
-    """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`."""
-    return bodies[..., :3, :].take_along_dim(index[..., None, None].expand(*index.shape, 3, 4), -3)
+    """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`; either may be that of one world for all."""
+    batch = torch.broadcast_shapes(bodies.shape[:-3], index.shape[:-1])
+    place = index[..., None, None].expand(*batch, index.shape[-1], 3, 4)
+    return bodies[..., :3, :].expand(*batch, *bodies.shape[-3:-2], 3, 4).take_along_dim(place, -3)
 
 
 def _outlook(slots: Slots, obstacles: int, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
