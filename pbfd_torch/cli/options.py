@@ -19,7 +19,7 @@ from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.coulomb_friction import DryFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 
@@ -154,7 +154,7 @@ def with_friction(setup: Setup, choice: Friction | None, dt: float) -> Setup:
 
 
 def _law(choice: Friction, contact: Contact | BodyContact, dt: float) -> FrictionLaw | None:
-    if choice is Friction.NONE or not isinstance(contact.friction, CoulombFriction):
+    if choice is Friction.NONE or not isinstance(contact.friction, DryFriction):
         return None
     base = PbfdFriction.as_printed(0.0) if choice is Friction.PBFD_PRINTED else PbfdFriction.as_derived(0.0)
     return base.calibrated(contact.friction.mu, contact.normal_force.stiffness, CALIBRATION_SPEED, dt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
@@ -30,19 +31,22 @@ def slip_work(size: Tensor, width: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class CoulombFriction:
-    """f∥ = −μ N s(‖u‖) u (METHOD §4): the dry friction law, smooth below the slip speed ε_v.
-
-    `mu`: coefficient ≥ 0, one number or one per candidate `[*, npoint]` (MuJoCo's rule for two surfaces: the larger one).
-    `slip_speed`: ε_v [m/s] > 0; under a tangential load W a sticking contact creeps at ε_v (1 − √(1 − W/(μN))),
-    which is ε_v W/(2μN) while W is small."""
+class DryFriction(ABC):
+    """f∥ = −μ N s(‖u‖) u, smooth over some width of slip; Coulomb's law and those like it. `mu`: coefficient ≥ 0, one number or one
+    per candidate `[*, npoint]` (MuJoCo's rule for two surfaces: the larger one)."""
 
     mu: float | Tensor
-    slip_speed: float = 1e-3
 
     def __post_init__(self) -> None:
         require_non_negative("mu", self.mu)
-        require_positive("slip_speed", self.slip_speed, "m/s")
+
+    @abstractmethod
+    def width(self, dt: Tensor) -> Tensor:
+        """ε [m], the slip over a step from which on friction is fully there."""
+
+    @abstractmethod
+    def widened(self, factor: float) -> Self:
+        """See `SlipLaw`."""
 
     def take(self, worlds: Worlds) -> Self:
         """The same law with the μ of some worlds."""
@@ -50,17 +54,35 @@ class CoulombFriction:
 
     def drag(self, normal: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> Tensor:
         """μ N s(y)."""
-        return self.mu * normal * slip_factor(size, self.slip_speed * dt)
+        return self.mu * normal * slip_factor(size, self.width(dt))
 
     def drag_slopes(self, normal: Tensor, normal_slope: Tensor, depth: Tensor, size: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
         """See `FrictionLaw`."""
-        width = self.slip_speed * dt
+        width = self.width(dt)
         slope = per_size(slip_factor_slope(size, width), size)
         return self.mu * normal_slope * slip_factor(size, width), self.mu * normal * slope
 
     def slip_energy(self, normal: Tensor, depth: Tensor, slip: Tensor, dt: Tensor) -> Tensor:
         """μ N S(‖u‖) [J] `[*, n]` (see `slip_work`): minus its gradient by the slip, with N held still, is the force."""
-        return self.mu * normal * slip_work(slip_size(slip), self.slip_speed * dt)
+        return self.mu * normal * slip_work(slip_size(slip), self.width(dt))
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombFriction(DryFriction):
+    """The dry friction law (METHOD §4), smooth below the slip speed ε_v: ε = ε_v Δt.
+
+    `slip_speed`: ε_v [m/s] > 0; under a tangential load W a sticking contact creeps at ε_v (1 − √(1 − W/(μN))),
+    which is ε_v W/(2μN) while W is small."""
+
+    slip_speed: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("slip_speed", self.slip_speed, "m/s")
+
+    def width(self, dt: Tensor) -> Tensor:
+        """See `DryFriction`."""
+        return self.slip_speed * dt
 
     def widened(self, factor: float) -> Self:
         """The same law, smooth below `factor` ≥ 1 times the slip speed."""
