@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.bench_solvers import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
 from pbfd_torch.cli.options import use_threads
 from pbfd_torch.errors import InputError
 

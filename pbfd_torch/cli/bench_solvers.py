@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import math
-import os
-import platform
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
 from pbfd_torch.cli.options import Choices, load_setup, use_threads
 from pbfd_torch.errors import InputError
 from pbfd_torch.simulator import SHORTEST_STEP
-
-bench = typer.Typer(no_args_is_help=True, help="Measures what the library does against the paper's claims.")
 
 LONGEST_STEP = 0.1  # [s]: the paper's largest
 MOST_STEPS, MOST_WORLDS, MOST_REPEATS, MOST_DOFS = 10_000, 4096, 1000, 200
 FILES = ("solvers.json", "fig4.png", "table1.png")
 
 
-@bench.command()
 def solvers(
     out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-solvers"),
     steps: Annotated[int, typer.Option(help="Fig. 4: steps of each chain.")] = 60,
@@ -84,15 +78,6 @@ def parsed_sizes(text: str) -> list[int]:
     return found
 
 
-def check_folder(folder: Path, files: Sequence[str]) -> None:
-    """Raises `InputError` now rather than after the measurement."""
-    existing = folder
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
-    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in files):
-        raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
-
-
 def measured(
     steps: int, dt: float | None, worlds: int, seconds: float, sizes: Sequence[int], batch: int, repeats: int
 ) -> dict[str, Any]:
@@ -132,45 +117,6 @@ def measured(
     }
 
 
-def environment() -> dict[str, Any]:
-    """What the numbers were measured with."""
-    return {
-        "pbfd_torch": _version(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-        "processor": _processor(),
-        "threads": torch.get_num_threads(),
-        "dtype": "float64",
-        "device": "cpu",
-    }
-
-
-def _version() -> str | None:
-    """The installed version; None in a checkout that is not installed."""
-    try:
-        return importlib.metadata.version("pbfd_torch")
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _processor() -> str:
-    """The CPU's name, where the system tells it."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
-
-
-def plain(value: Any) -> Any:
-    """The same with None for NaN and infinity, which JSON lacks."""
-    if isinstance(value, dict):
-        return {key: plain(x) for key, x in value.items()}
-    if isinstance(value, list):
-        return [plain(x) for x in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write(report: dict[str, Any], folder: Path) -> None:
     """The three files. Raises `InputError` where they cannot be written."""
     from pbfd_torch.bench.pictures import draw_figure_4, draw_table_1
@@ -203,14 +149,6 @@ def print_report(report: dict[str, Any], folder: Path) -> None:
         f"\n{report['wall_s']:.0f} s; PyTorch {about['torch']}, {about['threads']} thread, {about['dtype']}, {about['processor']}"
     )
     print(f"written: {', '.join(str(folder / name) for name in FILES)}")
-
-
-def new_table(title: str, *headers: str) -> Table:
-    """An empty table in the style of the benchmarks."""
-    result = Table(title=title, title_justify="left", header_style="bold cyan", padding=(0, 1, 0, 0), box=None)
-    for k, header in enumerate(headers):
-        result.add_column(header, justify="right" if k else "left", overflow="fold")
-    return result
 
 
 def _figure_4_table(name: str, chain: dict[str, Any]) -> Table:

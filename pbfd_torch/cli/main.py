@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from pbfd_torch.cli.bench_friction import friction as bench_friction
-from pbfd_torch.cli.bench_solvers import bench
+from pbfd_torch.cli.bench_friction import friction
+from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
 from pbfd_torch.errors import NotModelledWarning, PbfdError
 
@@ -21,7 +21,9 @@ app = typer.Typer(
     help="Articulated bodies with frictional contact, stable at large time steps. "
     "Exit status: 0 solved, 1 some step unsolved, 2 bad input.",
 )
-bench.command("friction")(bench_friction)
+bench = typer.Typer(no_args_is_help=True, help="Measures what the library does against the paper's claims.")
+bench.command()(solvers)
+bench.command()(friction)
 app.add_typer(bench, name="bench")
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)

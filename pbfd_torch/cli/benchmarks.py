@@ -1,0 +1,72 @@
+"""What the `pbfd bench` commands share: checks, the environment they measured in, plain JSON values, and tables."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import os
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.table import Table
+
+from pbfd_torch.errors import InputError
+
+
+def check_folder(folder: Path, files: Sequence[str]) -> None:
+    """Raises `InputError` now rather than after the measurement."""
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in files):
+        raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
+
+
+def environment() -> dict[str, Any]:
+    """What the numbers were measured with."""
+    return {
+        "pbfd_torch": _version(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "threads": torch.get_num_threads(),
+        "dtype": "float64",
+        "device": "cpu",
+    }
+
+
+def _version() -> str | None:
+    """The installed version; None in a checkout that is not installed."""
+    try:
+        return importlib.metadata.version("pbfd_torch")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    """The CPU's name, where the system tells it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def plain(value: Any) -> Any:
+    """The same with None for NaN and infinity, which JSON lacks."""
+    if isinstance(value, dict):
+        return {key: plain(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [plain(x) for x in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def new_table(title: str, *headers: str) -> Table:
+    """An empty table in the style of the benchmarks."""
+    result = Table(title=title, title_justify="left", header_style="bold cyan", padding=(0, 1, 0, 0), box=None)
+    for k, header in enumerate(headers):
+        result.add_column(header, justify="right" if k else "left", overflow="fold")
+    return result
