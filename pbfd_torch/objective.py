@@ -99,7 +99,7 @@ class BalanceObjective:
         worlds = Worlds(self.guess.shape[:-1], index)
         terms = [term.take(worlds) for term in self.terms]
         step = self.step.take(worlds)
-        memory = tuple(worlds.pick(x, x.ndim - len(worlds.batch)) for x in self.memory)
+        memory = tuple(map(worlds.rows, self.memory))
         return dataclasses.replace(
             self,
             articulation=step.previous.articulation,

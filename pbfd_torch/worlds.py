@@ -38,6 +38,10 @@ class Worlds:
         event = value.shape[value.ndim - rank :]
         return value.expand(*self.batch, *event).flatten(0, len(self.batch) - 1)[self.index]
 
+    def rows(self, value: Tensor) -> Tensor:
+        """Rows `[n, *event]` of a value `[*batch, *event]` that has all the batch's dimensions."""
+        return self.pick(value, value.ndim - len(self.batch))
+
 
 def replaced(instance: Instance, **changes: Any) -> Instance:
     """A copy of a frozen dataclass with some fields changed: `__post_init__` does not run, its checks being done, and cached

@@ -6,7 +6,6 @@ import copy
 import io
 import json
 import math
-import sys
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from itertools import pairwise
@@ -18,37 +17,24 @@ import torch
 
 from pbfd_torch.bench import figure_5
 from pbfd_torch.cli import bench_friction
-from pbfd_torch.cli.main import main
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
-from tests.printed import json_object
+from tests.printed import Printed, called
 
 FILES = {"friction.json", "fig5.png"}
 DURATION = 2.0
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """The exit status of the command, called in this process."""
-    monkeypatch.setattr(sys, "argv", ["pbfd", "bench", "friction", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert isinstance(end.value.code, int)
-    return end.value.code
+    """The exit status of `pbfd bench friction`."""
+    return called(monkeypatch, "bench", "friction", *arguments)
 
 
 @dataclass(frozen=True)
-class Ran:
+class Ran(Printed):
     """One call of the command with --quick --json: its exit status, what it printed, and its folder."""
 
-    status: int
-    out: str
-    err: str
     folder: Path
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """The one JSON object that was printed; NaN and infinity are refused."""
-        return json_object(self.out)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +51,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 @pytest.fixture(scope="module")
 def curves(ran: Ran) -> dict[str, dict[str, Any]]:
     """Case → time step → curve."""
-    found: dict[str, dict[str, Any]] = ran.report["curves"]
+    found: dict[str, dict[str, Any]] = ran.data["curves"]
     return found
 
 
@@ -73,9 +59,9 @@ def test_quick_run_writes_its_files(ran: Ran) -> None:
     """It ends well, silently but for the object; the folder holds both files, and the JSON one says the same."""
     assert (ran.status, ran.err) == (0, "")
     assert {file.name for file in ran.folder.iterdir()} == FILES
-    assert json.loads((ran.folder / "friction.json").read_text()) == ran.report
+    assert json.loads((ran.folder / "friction.json").read_text()) == ran.data
     assert (ran.folder / "fig5.png").read_bytes().startswith(b"\x89PNG")
-    assert ran.report["environment"]["dtype"] == "float64"
+    assert ran.data["environment"]["dtype"] == "float64"
 
 
 def test_every_step_is_solved(curves: dict[str, dict[str, Any]]) -> None:
@@ -166,7 +152,7 @@ def test_expected_distance_in_closed_form() -> None:
 def test_table_on_the_terminal_and_status(ran: Ran, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Without --json there is a table with every law, the notes, and where the files are. An unsolved step is shown, and the exit
     status is then 1."""
-    report = ran.report
+    report = ran.data
     monkeypatch.setattr(bench_friction, "write", lambda report, folder: None)
     for unsolved, status in ((0, 0), (3, 1)):
         shown = copy.deepcopy(report)

@@ -6,7 +6,6 @@ import copy
 import io
 import json
 import math
-import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -18,38 +17,24 @@ import pytest
 from pbfd_torch.bench import figure_4, table_1
 from pbfd_torch.bench.timing import exponent, fit_sizes, timed, worst
 from pbfd_torch.cli import bench_solvers
-from pbfd_torch.cli.main import main
 from pbfd_torch.solvers.named import TABLE_1
-from tests.printed import json_object
+from tests.printed import Printed, called
 
 TINY = ("--steps", "2", "--seconds", "0.05", "--sizes", "5,10", "--batch", "2", "--repeats", "1")
 FILES = {"solvers.json", "fig4.png", "table1.png"}
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """The exit status of the command, called in this process."""
-    monkeypatch.setattr(sys, "argv", ["pbfd", "bench", "solvers", *map(str, arguments)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    status = end.value.code
-    assert isinstance(status, int)
-    return status
+    """The exit status of `pbfd bench solvers`."""
+    return called(monkeypatch, "bench", "solvers", *arguments)
 
 
 @dataclass(frozen=True)
-class Ran:
+class Ran(Printed):
     """One call of the command with --json: its exit status, what it printed, its folder, and the report before it was printed."""
 
-    status: int
-    out: str
-    err: str
     folder: Path
     measured: dict[str, Any]
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """The one JSON object that was printed; NaN and infinity are refused."""
-        return json_object(self.out)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +60,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 @pytest.fixture(scope="module")
 def report(ran: Ran) -> dict[str, Any]:
     """What the tiny run printed."""
-    return ran.report
+    return ran.data
 
 
 def numbers(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -20,14 +19,13 @@ from tqdm import tqdm
 
 import pbfd_torch.cli.demo
 import pbfd_torch.cli.options
-from pbfd_torch.cli.main import main
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, SolverChoice
 from pbfd_torch.models import SCENES, Setup
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from tests.gymnasium_files import gymnasium_file
-from tests.printed import json_object
+from tests.printed import Printed, called
 
 ROOT = Path(__file__).parent.parent
 ARM = Path(__file__).parent / "data" / "arm_description" / "arm.urdf"
@@ -46,17 +44,8 @@ INFO_KEYS = {
 
 
 @dataclass(frozen=True)
-class Ran:
+class Ran(Printed):
     """How one call of the command ended."""
-
-    status: int
-    out: str
-    err: str
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """The one JSON object that was printed; raises for anything else, NaN and infinity included."""
-        return json_object(self.out)
 
     @property
     def words(self) -> str:
@@ -73,13 +62,10 @@ def pbfd(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)  # the command sets its own: back to this one at the end
 
     def call(*arguments: object) -> Ran:
-        monkeypatch.setattr(sys, "argv", ["pbfd", *map(str, arguments)])
         capsys.readouterr()
-        with warnings.catch_warnings(), pytest.raises(SystemExit) as end:
-            main()
+        with warnings.catch_warnings():
+            status = called(monkeypatch, *arguments)
         printed = capsys.readouterr()
-        status = end.value.code
-        assert isinstance(status, int)
         return Ran(status, printed.out, printed.err)
 
     return call

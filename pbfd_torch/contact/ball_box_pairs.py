@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.primitives import BoxSurface
 from pbfd_torch.contact.surface import Placed, Tangent
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.worlds import replaced
 
 
 @dataclass(frozen=True, eq=False)
-class BallBoxPairs:
+class BallBoxPairs(Finder):
     """Spheres beside boxes.
 
     Attributes:
         pair, first, second: `[m]` the number of each pair, the sphere's body, the box's.
         position, radius: `[m, 3]`, `[m]` the sphere's centre in its body's frame, and its radius [m].
         frame, half_extents: `[m, 3, 4]`, `[m, 3]` of the box in its body [m].
-        slots: how many candidates a world keeps.
     """
 
     pair: Tensor
@@ -32,7 +30,6 @@ class BallBoxPairs:
     radius: Tensor
     frame: Tensor
     half_extents: Tensor
-    slots: int
 
     def _box(self, index: Tensor) -> Placed:
         # no new checks: the sizes were checked when the shapes were made
@@ -59,14 +56,6 @@ class BallBoxPairs:
             surface=surface,
             dropped=dropped,
         )
-
-    def take(self, worlds: Worlds) -> Self:
-        """Itself: all worlds have the same colliders."""
-        return self
-
-    def grown(self) -> Self:
-        """See `Finder`."""
-        return replaced(self, slots=2 * self.slots)
 
 
 _TEMPLATE = BoxSurface(torch.ones(1, 3))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, Self
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.contact.surface import Surface
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.worlds import replaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,26 +35,21 @@ class Slots:
     dropped: Tensor
 
 
-class Finder(Protocol):
-    """Finds the candidates of a step, all of one kind of solid."""
+@dataclass(frozen=True, eq=False)
+class Finder(ABC):
+    """Finds the candidates of a step, all of one kind of solid, between colliders that are the same in all worlds. `slots`: how
+    many candidates a world keeps."""
 
-    @property
-    def slots(self) -> int:
-        """How many slots a world has."""
-        ...
+    slots: int = field(kw_only=True)
 
+    @abstractmethod
     def find(self, bodies: Tensor, reach: Tensor) -> Slots:
         """Candidates between bodies that stand at `bodies` `[*batch, nbody, 4, 4]` and move at most `reach` `[*batch, nbody]` [m]
         in the step; constants of the step."""
-        ...
-
-    def take(self, worlds: Worlds) -> Self:
-        """The same finder for some worlds."""
-        ...
 
     def grown(self) -> Self:
         """The same finder with twice as many slots."""
-        ...
+        return replaced(self, slots=2 * self.slots)
 
 
 def nearest(gap: Tensor, within: Tensor, budget: int) -> tuple[Tensor, Tensor, Tensor]:

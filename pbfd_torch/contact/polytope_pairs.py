@@ -11,25 +11,24 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.contact.broad_phase import AllPairs, BroadPhase, FclTree
-from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.manifold import Manifold, manifold
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
 from pbfd_torch.contact.separation import box_separation, fcl_geometries, fcl_separation, rotated
 from pbfd_torch.contact.surface import Plane
-from pbfd_torch.worlds import Worlds, replaced
 
 POINTS = 8  # of one pair at most
 MANY = 30_000  # pairs from which on FCL's tree is faster than looking at all of them
 
 
 @dataclass(frozen=True, eq=False)
-class PolytopePairs:
+class PolytopePairs(Finder):
     """Attributes:
     pair: `[m]` the number of each pair.
     first, second: `[m]` their colliders.
@@ -37,7 +36,6 @@ class PolytopePairs:
     polytopes, table: the shapes `[c]`, and as tensors.
     boxes: `[m]` bool, pairs of two boxes.
     broad_phase: what picks the pairs that are looked at.
-    slots: how many candidates a world keeps.
     """
 
     pair: Tensor
@@ -49,7 +47,6 @@ class PolytopePairs:
     table: PolytopeTable
     boxes: Tensor
     broad_phase: BroadPhase
-    slots: int
 
     @staticmethod
     def of(
@@ -201,11 +198,3 @@ class PolytopePairs:
         position = zero[..., None].expand(*zero.shape, 3)
         first, second = number + self.body[self.first[0]], number + self.body[self.second[0]]
         return Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])
-
-    def take(self, worlds: Worlds) -> Self:
-        """Itself: all worlds have the same colliders."""
-        return self
-
-    def grown(self) -> Self:
-        """See `Finder`."""
-        return replaced(self, slots=2 * self.slots)

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.candidates import Slots, nearest
+from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.primitives import SegmentSurface, dot
 from pbfd_torch.contact.surface import Tangent
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.worlds import replaced
 
 
 @dataclass(frozen=True)
@@ -36,16 +35,15 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class RoundPairs:
+class RoundPairs(Finder):
     """Pairs of round colliders. `pair` `[m]`: the number of each pair; `first`, `second`: `[m]` bodies; `axes`: `[m, 4, 3]` the
-    ends of the first one's axis, then of the second one's; `radii`: `[m, 2]`; `slots`: how many candidates a world keeps."""
+    ends of the first one's axis, then of the second one's; `radii`: `[m, 2]`."""
 
     pair: Tensor
     first: Tensor
     second: Tensor
     axes: Tensor
     radii: Tensor
-    slots: int
 
     @staticmethod
     def of(pairs: Sequence[tuple[int, Round, Round]], slots: int, like: Tensor) -> RoundPairs:
@@ -62,7 +60,7 @@ class RoundPairs:
             index([b.body for _, _, b in ordered]),
             like.new_tensor([[a.start, a.end, b.start, b.end] for _, a, b in ordered]),
             like.new_tensor([[a.radius, b.radius] for _, a, b in ordered]),
-            slots,
+            slots=slots,
         )
 
     def find(self, bodies: Tensor, reach: Tensor) -> Slots:
@@ -96,14 +94,6 @@ class RoundPairs:
             surface=surface,
             dropped=dropped,
         )
-
-    def take(self, worlds: Worlds) -> Self:
-        """Itself: all worlds have the same colliders."""
-        return self
-
-    def grown(self) -> Self:
-        """See `Finder`."""
-        return replaced(self, slots=2 * self.slots)
 
 
 # its numbers are replaced at once: parameters were checked when the shapes were made

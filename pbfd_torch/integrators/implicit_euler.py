@@ -39,7 +39,7 @@ class State:
             q_previous=worlds.pick(self.q_previous, 1),
             time=worlds.pick(self.time, 0),
             hazards=worlds.pick(self.hazards, 0),
-            memory=tuple(worlds.pick(x, x.ndim - len(worlds.batch)) for x in self.memory),
+            memory=tuple(map(worlds.rows, self.memory)),
         )
 
 

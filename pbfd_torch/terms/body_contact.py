@@ -87,7 +87,6 @@ class BodyContact:
         """The same contact of some worlds."""
         return replaced(
             self,
-            finder=self.finder.take(worlds),
             obstacles=tuple(x.take(worlds) for x in self.obstacles),
             normal_force=self.normal_force.take(worlds),
             friction=None if self.friction is None else self.friction.take(worlds),
