@@ -1,0 +1,1 @@
+"""The conventional formulation, to compare with: Newton–Euler equations with complementarity conditions for contact."""
