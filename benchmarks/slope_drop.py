@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import torch
 
+from pbfd_torch.bench.mujoco_runs import loaded
 from pbfd_torch.models import SCENES, chains
 from pbfd_torch.simulator import Simulator
 
@@ -43,29 +44,8 @@ def ours(dt: float, worlds: int, duration: float) -> dict[str, Any]:
     }
 
 
-def mjcf(dt: float, integrator: str) -> str:
-    """The same chain, start and slope for MuJoCo, with stiff contacts and elliptic cones."""
-    start = SCENES["chain-slope-drop"]().q[0].tolist()
-    position, turn = (" ".join(map(repr, part)) for part in (start[:3], start[3:7]))
-    g, slope = chains.GRAVITY, chains.SLOPE
-    across = chains.MASS * (3 * chains.RADIUS**2 + chains.LENGTH**2) / 12
-    moments = f"{chains.MASS * chains.RADIUS**2 / 2} {across} {across}"
-    inertial = f'<inertial pos="{chains.LENGTH / 2} 0 0" mass="{chains.MASS}" diaginertia="{moments}"/>'
-    sphere = f'<geom type="sphere" size="{chains.RADIUS}" contype="1" conaffinity="0" pos='
-    shapes = f'{inertial}{sphere}"0 0 0"/>{sphere}"{chains.LENGTH} 0 0"/>'
-    body = ""
-    for k in reversed(range(10)):
-        joint = "<freejoint/>" if k == 0 else '<joint type="hinge" axis="0 1 0"/>'
-        place = f'pos="{position}" quat="{turn}"' if k == 0 else f'pos="{chains.LENGTH} 0 0"'
-        body = f"<body {place}>{joint}{shapes}{body}</body>"
-    return f"""<mujoco><option timestep="{dt}" integrator="{integrator}" cone="elliptic" impratio="100"
-        gravity="{g * math.sin(slope)} 0 {-g * math.cos(slope)}"/>
-      <default><geom friction="{chains.SLOPE_FRICTION} 0 0" solref="{2 * dt} 1" solimp=".99 .999 .001"/></default>
-      <worldbody><geom type="plane" size="500 5 1" conaffinity="1" contype="0"/>{body}</worldbody></mujoco>"""
-
-
 def theirs(dt: float, integrator: str, duration: float) -> dict[str, Any]:
-    model = mujoco.MjModel.from_xml_string(mjcf(dt, integrator))
+    model = loaded("chain-slope-drop", dt, integrator)
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

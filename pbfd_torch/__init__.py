@@ -2,7 +2,11 @@
 
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.errors import InputError, ModelError, NotModelledWarning, PbfdError
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.bdf2 import Bdf2
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import State
+from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Scene, Simulator
 from pbfd_torch.solvers.descent import Descent
@@ -11,7 +15,9 @@ from pbfd_torch.solvers.objective import Solution, Status
 
 __all__ = [
     "Articulation",
+    "Bdf2",
     "Descent",
+    "EnergyMomentum",
     "Fallbacks",
     "ImplicitEuler",
     "InputError",
@@ -27,4 +33,5 @@ __all__ = [
     "Solution",
     "State",
     "Status",
+    "Variational",
 ]

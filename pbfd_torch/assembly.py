@@ -15,30 +15,17 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement, link_jacobians
-from pbfd_torch.rotations import unskew
-from pbfd_torch.terms.load import JointLoad, LinkLoad, Load
-
-
-def subtree_sum(placement: Placement, of_links: Tensor) -> Tensor:
-    """Sum over all links that each joint moves, `[*batch, nlink, r, c] → [*batch, njoint, r, c]`."""
-    mask = placement.articulation.topology.subtree.to(of_links.dtype)
-    mask = mask.expand(*of_links.shape[:-3], *mask.shape)
-    return (mask @ of_links.flatten(-2)).unflatten(-1, of_links.shape[-2:])
+from pbfd_torch.chords import ChordBalance
+from pbfd_torch.kinematics import Placement, link_jacobians, link_residual, subtree_sum
+from pbfd_torch.terms.load import ChordLoad, JointLoad, LinkLoad, Load
 
 
 def _total(values: Iterable[Tensor]) -> Tensor:
     return functools.reduce(operator.add, values)
 
 
-def link_residual(placement: Placement, moment: Tensor) -> Tensor:
-    """r_i = s_i · W of subtree-summed moments `[*batch, njoint, 3, 4]`: `[*batch, nv]`."""
-    wrench = torch.cat((unskew(moment[..., :3]), moment[..., 3]), -1)
-    return (placement.axes * wrench[..., placement.articulation.topology.dof_joint, :]).sum(-1)
-
-
 class Balance:
-    """The balance of a sum of loads, of which at least one is on links. The matrices are assembled when first asked for.
+    """The balance of a sum of loads. The matrices are assembled when first asked for.
 
     placement, loads: where, and of what. residual: r `[*batch, nv]` [N, N m], zero where Newton's law holds at the end of the
     step."""
@@ -48,16 +35,27 @@ class Balance:
         self.loads = loads
         self._on_joints = [x for x in loads if isinstance(x, JointLoad)]
         self._on_links = [x for x in loads if isinstance(x, LinkLoad)]
-        self._moment = subtree_sum(placement, _total(x.moment for x in self._on_links))
-        self.residual = link_residual(placement, self._moment)
+        self.chords = [ChordBalance(x) for x in loads if isinstance(x, ChordLoad)]
+        nothing = placement.poses.new_zeros(()).expand(*placement.poses.shape[:-2], 3, 4)
+        self._moment = subtree_sum(placement, _total([x.moment for x in self._on_links] or [nothing]))
+        self.residual = link_residual(placement, self._moment, placement.axes)
+        for chord in self.chords:
+            self.residual = self.residual + chord.residual
         for load in self._on_joints:
             self.residual = self.residual + load.residual
 
     @cached_property
     def stiffness(self) -> Tensor:
         """The part of J without the curvature of the tree (B = 0), `[*batch, nv, nv]`."""
+        smooth = [x.stiffness for x in self.chords]
+        return _total([self._on_moving_links, *smooth, *(x.stiffness for x in self._on_joints)])
+
+    @cached_property
+    def _on_moving_links(self) -> Tensor:
         t, axes = self.placement.articulation.topology, self.placement.axes
         column = axes[..., None]
+        if not self._on_links:
+            return axes.new_zeros(())
         summed = subtree_sum(self.placement, _total(x.stiffness for x in self._on_links))[..., t.dof_joint, :, :]
         below = (summed @ column).squeeze(-1)  # A s_j: j moves, the rows at or above j feel it
         above = (summed.mT @ column).squeeze(-1)  # Aᵀ s_j: something above moves, row j feels it
@@ -67,8 +65,6 @@ class Balance:
         for load in self._on_links:
             if load.coupled:
                 convex = convex + self._coupled(load.coupling)
-        for joint_load in self._on_joints:
-            convex = convex + joint_load.stiffness
         return convex
 
     def _coupled(self, coupling: Tensor) -> Tensor:
@@ -87,4 +83,7 @@ class Balance:
         torque = torch.linalg.cross(*torch.broadcast_tensors(force, v))
         turned = (first.mT @ omega[..., None]).squeeze(-1) - trace * omega - torque
         curved = t.curvature_weight.to(axes.dtype) * (omega @ turned.mT)
-        return self.stiffness + curved + curved.mT
+        total = self.stiffness + curved + curved.mT
+        for chord in self.chords:
+            total = total + chord.curvature
+        return total

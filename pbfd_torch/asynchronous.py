@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.implicit_euler import State
+from pbfd_torch.integrators.integrator import State
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
@@ -43,7 +43,9 @@ class AsynchronousRollout:
     def __init__(self, simulator: Simulator, state: State, steps: int, control: Tensor | Policy | None = None) -> None:
         solver = simulator.solver
         self._fallbacks: Fallbacks | None
-        if isinstance(solver, Fallbacks):
+        if isinstance(solver, Fallbacks) and simulator.integrator.easier:
+            self._direct, self._fallbacks = solver.first, None
+        elif isinstance(solver, Fallbacks):
             self._direct, self._fallbacks = solver.direct, solver
         elif isinstance(solver, Descent):
             self._direct, self._fallbacks = solver, None
@@ -123,17 +125,20 @@ class AsynchronousRollout:
         part = mapped(lambda x: x[index], self._progress)
         found = solution(part, part.q, 0)
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
-        aftermath = mapped(lambda x: x[index], self._objective.aftermath(self._progress.q))
-        if len(unsolved_worlds(found)):
+        # for all lanes, although most are not at the end: those that are, are not worth a scene of their own
+        integrator = self._simulator.integrator
+        advanced = integrator.advance(self._objective, self._state, self._progress.q)
+        refused = integrator.refused(self._objective, self._state, advanced)
+        advanced = mapped(lambda x: x[index], advanced)
+        refused = None if refused is None else refused[index]
+        if len(unsolved_worlds(found, refused)):
             simulator = self._simulator.take(lanes)
             if self._fallbacks is not None:
                 objective = self._objective.take(index)
                 found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
-                aftermath = objective.aftermath(found.q)
-            advanced, found = simulator.finished(state, held, found, aftermath)
+                advanced = integrator.advance(objective, state, found.q)
+            advanced, found = simulator.finished(state, held, advanced, found, refused)
             self.lanes += found.lanes
-        else:
-            advanced = self._simulator.integrator.advance(state, found.q, self._simulator.step_size, aftermath)
         self._record(index, advanced, held, found)
         self._state = mapped(lambda old, new: old.index_copy(0, index, new), self._state, advanced)
         self._step = self._step + ended

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance, link_residual, subtree_sum
-from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.assembly import Balance
+from pbfd_torch.kinematics import Motion, Placement, link_residual, place, subtree_sum
 from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.inertia import inertia_stiffness
 from pbfd_torch.terms.joint_springs import Armature
@@ -40,8 +40,7 @@ def bias_force(articulation: Articulation, q: Tensor, v: Tensor, gravity: Tensor
     drift = Motion(placement, v).accelerations
     fall = torch.zeros_like(drift)
     fall[..., 3] = gravity[..., None, :]
-    moment = (drift - fall) @ (placement.poses @ placement.articulation.pseudo_inertia).mT
-    return link_residual(placement, subtree_sum(placement, moment))
+    return generalised_momentum(placement, drift - fall)
 
 
 def inverse_dynamics(
@@ -50,6 +49,12 @@ def inverse_dynamics(
     """Generalised force τ = M(q) v̇ + h(q, v) `[*batch, nv]` for acceleration v̇ `[*batch, nv]`."""
     inertia = (mass_matrix(articulation, q, terms) @ acceleration[..., None]).squeeze(-1)
     return inertia + bias_force(articulation, q, v, gravity)
+
+
+def generalised_momentum(placement: Placement, rates: Tensor) -> Tensor:
+    """⟨S Ṫ, ∂T/∂θ⟩ `[*batch, nv]` of links whose poses change at `rates` Ṫ `[*batch, nlink, 3, 4]`: M v where Ṫ = Σ ŝ_i T v_i."""
+    moment = rates @ (placement.poses @ placement.articulation.pseudo_inertia).mT
+    return link_residual(placement, subtree_sum(placement, moment), placement.axes)
 
 
 def center_of_mass(placement: Placement) -> Tensor:

@@ -20,6 +20,7 @@ from pbfd_torch.rotations import (
     quaternion_multiply,
     quaternion_normalize,
     skew,
+    unskew,
 )
 
 
@@ -50,6 +51,34 @@ def place(articulation: Articulation, q: Tensor) -> Placement:
     nodes = node_poses(articulation, q)
     poses = nodes[..., articulation.topology.link_node_index, :, :] @ articulation.link_frame
     return Placement(articulation, q, nodes, poses)
+
+
+@dataclass(frozen=True, eq=False)
+class Chord:
+    """Between two placements: `share` w `[*batch]` of the way from every pose of the start to that of the end, in a straight
+    line; its rotation matrices are none, but shrink by the cosine of half the turn in the middle."""
+
+    start: Placement
+    end: Placement
+    share: Tensor
+
+    def _between(self, start: Tensor, end: Tensor) -> Tensor:
+        return start + self.share[..., None, None, None] * (end - start)
+
+    @cached_property
+    def poses(self) -> Tensor:
+        """`[*batch, nlink, 4, 4]`."""
+        return self._between(self.start.poses, self.end.poses)
+
+    @cached_property
+    def nodes(self) -> Tensor:
+        """`[*batch, nnode, 4, 4]`."""
+        return self._between(self.start.nodes, self.end.nodes)
+
+    @cached_property
+    def axes(self) -> Tensor:
+        """Twists of the degrees of freedom about the axes on the chord, `[*batch, nv, 6]`."""
+        return motion_axes(self.end.articulation, self.nodes)
 
 
 def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
@@ -108,6 +137,19 @@ def local_twists(articulation: Articulation) -> Tensor:
     moving = torch.stack((flat, eye), -1).repeat(*[1] * (axis.ndim - 2), len(t.free_v), 1, 1)
     turning = torch.stack((eye, flat), -1).repeat(*[1] * (axis.ndim - 2), len(t.turning_v), 1, 1)
     return torch.cat((scalar, moving, turning), -3)[..., t.v_order, :, :]
+
+
+def subtree_sum(placement: Placement, of_links: Tensor) -> Tensor:
+    """Sum over all links that each joint moves, `[*batch, nlink, r, c] → [*batch, njoint, r, c]`."""
+    mask = placement.articulation.topology.subtree.to(of_links.dtype)
+    mask = mask.expand(*of_links.shape[:-3], *mask.shape)
+    return (mask @ of_links.flatten(-2)).unflatten(-1, of_links.shape[-2:])
+
+
+def link_residual(placement: Placement, moment: Tensor, axes: Tensor) -> Tensor:
+    """r_i = s_i · W of subtree-summed moments `[*batch, njoint, 3, 4]` along twists s `[*batch, nv, 6]`: `[*batch, nv]`."""
+    wrench = torch.cat((unskew(moment[..., :3]), moment[..., 3]), -1)
+    return (axes * wrench[..., placement.articulation.topology.dof_joint, :]).sum(-1)
 
 
 def link_jacobians(placement: Placement) -> Tensor:

@@ -18,7 +18,18 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement, place, retract
 from pbfd_torch.outlook import Outlook
 from pbfd_torch.solvers.objective import Evaluation, weighted_error
-from pbfd_torch.terms.load import Aftermath, Frictional, Hazardous, Load, OneSided, Potential, Remembering, StepContext, Term
+from pbfd_torch.terms.load import (
+    Aftermath,
+    Frictional,
+    Hazardous,
+    Load,
+    OneSided,
+    Potential,
+    Pushing,
+    Remembering,
+    StepContext,
+    Term,
+)
 from pbfd_torch.worlds import Worlds
 
 
@@ -145,6 +156,16 @@ class BalanceObjective:
             if isinstance(term, Hazardous):
                 hazards = hazards | term.hazards(prepared, placement)
         return Aftermath(tuple(memory), hazards)
+
+    def push(self, q: Tensor) -> Tensor:
+        """How hard contacts and limits push in all at the end of a step, in weights of the articulation, `[*batch]`."""
+        placement = place(self.articulation, q)
+        total = torch.zeros_like(q[..., 0])
+        for term, prepared in zip(self.terms, self.prepared, strict=True):
+            if isinstance(term, Pushing):
+                total = total + term.push(prepared, placement)
+        lever = torch.where(self.articulation.topology.turns, reach(self.articulation)[..., None], 1.0)
+        return total / (self.scale / lever)[..., 0]
 
     def _with(self, terms: Sequence[Term]) -> Self:
         return dataclasses.replace(self, terms=terms)

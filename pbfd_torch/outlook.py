@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pbfd_torch.assembly import Balance
 from pbfd_torch.kinematics import Motion, Placement, retract
-from pbfd_torch.terms.load import LinkLoad, Term
+from pbfd_torch.terms.load import ChordLoad, JointLoad, LinkLoad, Term
 
 
 class Outlook:
@@ -28,12 +28,18 @@ class Outlook:
         self._foretold: list[Callable[[Tensor], Tensor]] = []
         self._on_joints: list[tuple[Term, Any]] = []
         for term, fixed, load in zip(terms, prepared, balance.loads, strict=True):
+            if isinstance(load, ChordLoad):
+                continue
             if not isinstance(load, LinkLoad):
                 self._on_joints.append((term, fixed))
             elif load.outlook is None:
                 self._add_linear(load)
             else:
                 self._foretold.append(load.outlook(self._motion))
+        for chord in balance.chords:
+            answer = ((chord.stiffness + chord.curvature) * direction[..., None, :]).sum(-1)
+            self._constant = self._constant + (chord.residual * direction).sum(-1)
+            self._slope = self._slope + (answer * direction).sum(-1)
 
     def _add_linear(self, load: LinkLoad) -> None:
         """⟨M, [V]⟩ and its change V·A V + ⟨M, [V̇] + [V]²⟩, M the moment and A the stiffness."""
@@ -60,6 +66,6 @@ class Outlook:
         work = torch.zeros_like(length)
         for term, fixed in self._on_joints:
             load = term.load(fixed, moved)
-            if not isinstance(load, LinkLoad):
+            if isinstance(load, JointLoad):
                 work = work + (load.residual * d).sum(-1)
         return work

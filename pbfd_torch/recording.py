@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.integrator import Integrator, State
 from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rollout import Rollout
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Recorder:
     """Collects one entry per step; `finish` stacks them."""
 
-    def __init__(self, scene: Scene, integrator: ImplicitEuler, dt: float, state: State) -> None:
+    def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, state: State) -> None:
         self._scene, self._integrator, self._dt = scene, integrator, dt
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0

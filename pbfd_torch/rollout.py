@@ -19,7 +19,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.solvers.objective import is_solved
 
-FORMAT = "pbfd_torch rollout 3"
+FORMAT = "pbfd_torch rollout 4"
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Rollout:
             earlier than the potential one, which holds gravity, springs, limits and contacts.
         linear_momentum, angular_momentum: `[T + 1, *batch, 3]`, the latter about the centre of mass.
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
-        fallbacks: `[T, *batch, 3]` int, how often each of `FALLBACKS` was tried.
+        fallbacks: `[T, *batch, 4]` int, how often each of `FALLBACKS` was tried.
         hazards: `[T, *batch]` int, `Hazard` bits: what may be wrong with a step although it was solved.
         lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -17,7 +18,8 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.errors import ContactOverflowError, InputError, ModelError
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.recording import Recorder
@@ -27,7 +29,7 @@ from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status,
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
-from pbfd_torch.terms.load import Aftermath, Conservative, Term
+from pbfd_torch.terms.load import Conservative, Term
 from pbfd_torch.worlds import Worlds, replaced
 
 SHORTEST_STEP = 1e-5  # [s]
@@ -105,7 +107,7 @@ class Scene:
         return replaced(self, articulation=self.articulation.take(worlds), terms=terms, gravity=worlds.pick(self.gravity, 1))
 
 
-class Simulator:
+class Simulator(Generic[S]):
     """Steps a scene.
 
     `dt`: step [s] > 0; smaller than 1e-5 is refused because rounding would dominate the positions' differences. `halvings`: how
@@ -115,7 +117,7 @@ class Simulator:
         self,
         scene: Scene,
         dt: float,
-        integrator: ImplicitEuler | None = None,
+        integrator: Integrator[S] | None = None,
         solver: Solver | None = None,
         halvings: int = 3,
     ) -> None:
@@ -126,32 +128,45 @@ class Simulator:
         a = scene.articulation
         self.scene = scene
         self.dt = float(dt)
-        self.integrator = integrator or ImplicitEuler()
+        self.integrator: Integrator[S] = integrator or cast(Integrator[S], ImplicitEuler())
         self.solver: Solver = solver or Fallbacks()
         self.halvings = halvings
         self.step_size = torch.tensor(dt, dtype=a.dtype, device=a.device)
+        self._terms = self.integrator.adapted(a, scene.terms, self.step_size)
         parameters = (scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
         self._batch = torch.broadcast_shapes(*parameters)
         self._scale = force_scale(a, torch.linalg.vector_norm(scene.gravity, dim=-1))
 
-    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> State:
+    @property
+    def first_solver(self) -> Solver:
+        """What a step is given to first: no detours where there is an easier step."""
+        if self.integrator.easier and isinstance(self.solver, Fallbacks):
+            return self.solver.first
+        return self.solver
+
+    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).
         One configuration goes to all worlds where the velocity, gravity or the articulation's parameters have several.
 
-        The start is of second order: the acceleration comes from a trial step, so stiff contacts are felt as they will be. A world
-        whose trial step does not solve starts at first order. Raises `InputError` for wrong shapes, dtypes, devices or NaN."""
+        The start is of second order. Integrators that keep positions take the acceleration from a trial step, so stiff contacts are
+        felt as they will be; a world whose trial step does not solve starts at first order. Raises `InputError` for wrong shapes,
+        dtypes, devices or NaN."""
         a = self.scene.articulation
         q = a.rest if q is None else self._checked(q, a.nq, "q")
         v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
         batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
         q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
         q = a.topology.normalized(q)
-        still = self.integrator.start(a, q, v, torch.zeros_like(v), self.step_size)
-        trial, solution = self.step(still, control)
-        gained = self.integrator.velocity(a, trial, self.step_size) - v
-        acceleration = torch.where(solution.solved[..., None], gained / self.step_size, 0.0)
-        start = self.integrator.start(a, q, v, acceleration, self.step_size)
+        start = self.integrator.start(a, q, v, lambda: self._acceleration(q, v, control), self.step_size)
         return replaced(start, memory=blank_memory(self.scene.terms, tuple(batch)))
+
+    def _acceleration(self, q: Tensor, v: Tensor, control: Tensor | None) -> Tensor:
+        """Of a trial step of implicit Euler that sets out with v."""
+        a, scheme = self.scene.articulation, ImplicitEuler()
+        trial = Simulator(self.scene, self.dt, scheme, self.solver, self.halvings)
+        end, solution = trial.step(scheme.start(a, q, v, lambda: torch.zeros_like(v), self.step_size), control)
+        gained = scheme.velocity(a, end, self.step_size) - v
+        return torch.where(solution.solved[..., None], gained / self.step_size, 0.0)
 
     def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
         a = self.scene.articulation
@@ -163,28 +178,37 @@ class Simulator:
             raise InputError(f"{name} holds NaN or infinity")
         return value
 
-    def objective(self, state: State, control: Tensor | None = None) -> BalanceObjective:
+    def objective(self, state: S, control: Tensor | None = None) -> BalanceObjective:
         """The balance of forces that the step from `state` solves."""
         articulation = self.scene.articulation
         context = self.integrator.context(articulation, state, self.step_size, self.scene.gravity, control)
-        return BalanceObjective.of_step(articulation, self.scene.terms, context, self._scale, state.memory)
+        return BalanceObjective.of_step(articulation, self._terms, context, self._scale, state.memory)
 
-    def step(self, state: State, control: Tensor | None = None) -> tuple[State, Solution]:
+    def step(self, state: S, control: Tensor | None = None) -> tuple[S, Solution]:
         """One step of all worlds under `control` `[*batch, nu]` (None: zero). Never raises for one bad world: see the solution's
         status. An unsolved world goes on from the best point found."""
         advanced, solution, _ = self._step(state, control)
         return advanced, solution
 
-    def _step(self, state: State, control: Tensor | None) -> tuple[State, Solution, BalanceObjective]:
+    def _step(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective]:
         with torch.no_grad():
             objective = self.objective(state, control)
-            solution = self.solver.solve(objective, objective.guess, state.q)
-            return *self.finished(state, control, solution, objective.aftermath(solution.q)), objective
+            solution = self.first_solver.solve(objective, objective.guess, state.q)
+            advanced = self.integrator.advance(objective, state, solution.q)
+            refused = self.integrator.refused(objective, state, advanced)
+            return *self.finished(state, control, advanced, solution, refused), objective
 
-    def finished(self, state: State, control: Tensor | None, solution: Solution, aftermath: Aftermath) -> tuple[State, Solution]:
-        """The state after a step that the solver has left at `solution`, with this aftermath: unsolved worlds try shorter steps
-        first."""
-        advanced = self.integrator.advance(state, solution.q, self.step_size, aftermath)
+    def finished(
+        self, state: S, control: Tensor | None, advanced: S, solution: Solution, refused: Tensor | None
+    ) -> tuple[S, Solution]:
+        """The state after a step that the solver has left at `solution`, from which the integrator would go on to `advanced`:
+        worlds that are unsolved or refused try easier steps, and those that still are unsolved shorter ones."""
+        index = unsolved_worlds(solution, refused)
+        for easier in self.integrator.easier:
+            if len(index) == 0:
+                break
+            advanced, solution = self._eased(state, control, advanced, solution, index, easier)
+            index = unsolved_worlds(solution)
         for halvings in range(1, self.halvings + 1):
             index = unsolved_worlds(solution)
             if len(index) == 0 or self.dt / 2**halvings < SHORTEST_STEP:
@@ -192,13 +216,34 @@ class Simulator:
             advanced, solution = self._halved(state, control, advanced, solution, index, 2**halvings)
         return advanced, solution
 
-    def take(self, worlds: Worlds) -> Simulator:
+    def take(self, worlds: Worlds) -> Simulator[S]:
         """The simulator of some worlds."""
-        return Simulator(self.scene.take(worlds), self.dt, self.integrator, self.solver, self.halvings)
+        part = copy.copy(self)
+        part.scene = self.scene.take(worlds)
+        part._terms = [term.take(worlds) for term in self._terms]
+        part._scale = worlds.pick(self._scale, 1)
+        part._batch = torch.Size(()) if len(self._batch) == 0 else worlds.index.shape
+        return part
+
+    def _eased(
+        self, state: S, control: Tensor | None, advanced: S, solution: Solution, index: Tensor, easier: Integrator[S]
+    ) -> tuple[S, Solution]:
+        """The step of the worlds at `index` again, as one of another integrator. Unsolved worlds keep the result in any case,
+        refused ones if it is solved."""
+        worlds = Worlds(state.q.shape[:-1], index)
+        other = Simulator(self.scene.take(worlds), self.dt, easier, self.solver, halvings=0)
+        before, held = state.take(worlds), None if control is None else worlds.pick(control, 1)
+        objective = other.objective(before, held)
+        found = other.solver.solve(objective, objective.guess, before.q)
+        kept = found.solved | ~solution.solved.reshape(-1)[index]
+        unsolved = torch.where(solution.solved, solution.residual_norm, math.inf)
+        solution = dataclasses.replace(solution, residual_norm=unsolved)
+        result = merged(solution, index, [found], FALLBACKS.index("easier step"), Status.EASED)
+        return _put(advanced, other.integrator.advance(objective, before, found.q), worlds, kept), result
 
     def _halved(
-        self, state: State, control: Tensor | None, advanced: State, solution: Solution, index: Tensor, parts: int
-    ) -> tuple[State, Solution]:
+        self, state: S, control: Tensor | None, advanced: S, solution: Solution, index: Tensor, parts: int
+    ) -> tuple[S, Solution]:
         """The step of the worlds at `index` again, as `parts` shorter ones; a world keeps the result if all of them solve. It then
         goes on with the velocity of the last one."""
         worlds = Worlds(state.q.shape[:-1], index)
@@ -219,18 +264,11 @@ class Simulator:
         # an unfinished chain of short steps is no better end of the whole step, whatever its own residual
         climbs[-1] = dataclasses.replace(climbs[-1], status=failed, residual_norm=torch.where(solved, worst, math.inf))
         result = merged(solution, index, climbs, FALLBACKS.index("halving"), Status.HALVED)
-
-        def put(old: Tensor, new: Tensor) -> Tensor:
-            rows = old.reshape(math.prod(worlds.batch), *old.shape[len(worlds.batch) :])
-            before = rows[index]
-            kept = torch.where(solved.reshape(-1, *(1,) * (rows.ndim - 1)), new.reshape(before.shape), before)
-            return rows.index_copy(0, index, kept).reshape(old.shape)
-
-        return mapped(put, advanced, end), result
+        return _put(advanced, end, worlds, solved), result
 
     def rollout(
         self,
-        state: State,
+        state: S,
         controls: Tensor | None = None,
         steps: int | None = None,
         progress: Callable[[int], object] | None = None,
@@ -266,3 +304,16 @@ class Simulator:
         if steps is not None and steps != len(controls):
             raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
         return len(controls)
+
+
+def _put(state: S, part: S, worlds: Worlds, kept: Tensor) -> S:
+    """The state with that of some worlds replaced by `part`, where `kept` `[n]`."""
+
+    def put(old: Tensor, new: Tensor) -> Tensor:
+        rows = old.reshape(math.prod(worlds.batch), *old.shape[len(worlds.batch) :])
+        before = rows[worlds.index]
+        chosen = torch.where(kept.reshape(-1, *(1,) * (rows.ndim - 1)), new.reshape(before.shape), before)
+        return rows.index_copy(0, worlds.index, chosen).reshape(old.shape)
+
+    result: S = mapped(put, state, part)
+    return result

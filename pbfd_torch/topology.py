@@ -227,6 +227,12 @@ class Topology:
         return self.above | (self.same_joint & translating[:, None] & ~translating[None, :])
 
     @cached_property
+    def moves_axis(self) -> Tensor:
+        """`[nv, nv]` 1 where i moves the frame in which the twist of j is constant: all that `carries` it, and its own joint."""
+        translating = torch.tensor(self.translating, dtype=torch.bool, device=self.device)
+        return self.above | (self.same_joint & ~translating[None, :])
+
+    @cached_property
     def curvature_weight(self) -> Tensor:
         """`[nv, nv]` weight w of s_iᵀ B s_j in the Jacobian, J += Q + Qᵀ with Q = w ∘ (SᵀBS): 1 where i carries j's axis, ½ within
         one rotation, where the second derivative is the symmetric one of the exponential chart."""

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.implicit_euler import State
+from pbfd_torch.integrators.integrator import State
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.worlds import Worlds

@@ -93,12 +93,14 @@ class Fallbacks:
     last: solves the problem from where a detour has led.
     detours: tried in turn.
     stage: solves every stage of a detour.
+    first: solves the problem of a step that has an easier one to fall back on.
     """
 
     direct: Descent = field(default_factory=lambda: Descent(max_evaluations=200))
     last: Descent = field(default_factory=lambda: Descent(max_evaluations=100))
     detours: tuple[Detour, ...] = (WarmStart(), WIDTHS, STIFFNESSES)
     stage: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
+    first: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
 
     def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
         """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours."""

@@ -17,10 +17,11 @@ class Status(enum.IntEnum):
     SOLVED = 0
     WARM_STARTED = 1  # solved, from the minimiser of the energy with lagged friction
     CONTINUED = 2  # solved, by continuation in the friction's width or in stiffness
-    HALVED = 3  # solved, as two or more shorter steps
-    STALLED = 4  # no step along the search direction helps
-    ITERATION_LIMIT = 5
-    NON_FINITE = 6  # NaN or infinity in the guess or in the residual there
+    EASED = 3  # solved, but as a step of another integrator, which is easier
+    HALVED = 4  # solved, as two or more shorter steps
+    STALLED = 5  # no step along the search direction helps
+    ITERATION_LIMIT = 6
+    NON_FINITE = 7  # NaN or infinity in the guess or in the residual there
 
 
 def is_solved(status: Tensor) -> Tensor:
@@ -117,7 +118,7 @@ def weighted_error(residual: Tensor, scale: Tensor, rounding: Tensor | float, to
     return torch.linalg.vector_norm(residual / (scale + rounding / tolerance), dim=-1)
 
 
-FALLBACKS = ("warm start", "continuation", "halving")
+FALLBACKS = ("warm start", "continuation", "easier step", "halving")
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ class Solution:
     residual_norm: `[*batch]` ‖r / (scale + rounding/tolerance)‖₂.
     iterations: `[*batch]` int, steps taken.
     evaluations: `[*batch]` int, evaluations of the residual spent.
-    fallbacks: `[*batch, 3]` int, how often a warm start, a continuation and a halving of the step was tried (`FALLBACKS`).
+    fallbacks: `[*batch, 4]` int, how often each of `FALLBACKS` was tried.
     lanes: evaluations that the schedule spent on all worlds together, those on finished worlds included.
     """
 
@@ -146,6 +147,8 @@ class Solution:
         return is_solved(self.status)
 
 
-def unsolved_worlds(solution: Solution) -> Tensor:
-    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start."""
-    return (~solution.solved & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+def unsolved_worlds(solution: Solution, refused: Tensor | None = None) -> Tensor:
+    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved or refused, but from a finite
+    start."""
+    wanting = ~solution.solved if refused is None else ~solution.solved | refused
+    return (wanting & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)

@@ -14,7 +14,7 @@ from pbfd_torch.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.contact.surface import Plane
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, State
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -41,7 +41,7 @@ class Situation:
     """A tree in the middle of a step: where it was (θ_{n−1}, θ_n), and the iterate q at which terms are asked for their load."""
 
     articulation: Articulation
-    state: State
+    state: Positions
     q: Tensor
     dt: Tensor
     gravity: Tensor

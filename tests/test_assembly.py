@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import force_scale
-from pbfd_torch.assembly import Balance, subtree_sum
+from pbfd_torch.assembly import Balance
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import link_jacobians, place, retract
+from pbfd_torch.kinematics import link_jacobians, place, retract, subtree_sum
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia

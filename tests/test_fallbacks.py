@@ -46,9 +46,9 @@ def starts(*values: float) -> Tensor:
 @pytest.mark.parametrize(
     ("helps", "status", "tried"),
     [
-        ("lagged", Status.WARM_STARTED, [1, 0, 0]),
-        ("wide", Status.CONTINUED, [1, 1, 0]),
-        ("soft", Status.CONTINUED, [1, 2, 0]),
+        ("lagged", Status.WARM_STARTED, [1, 0, 0, 0]),
+        ("wide", Status.CONTINUED, [1, 1, 0, 0]),
+        ("soft", Status.CONTINUED, [1, 2, 0, 0]),
     ],
 )
 def test_detours_in_their_order(helps: str, status: Status, tried: list[int]) -> None:
@@ -75,7 +75,7 @@ def test_solved_worlds_are_left_alone() -> None:
     assert alone.status.tolist() == [Status.SOLVED, Status.ITERATION_LIMIT, Status.SOLVED]
     solution = Fallbacks(SHORT, SHORT).solve(landing("wide"), guess)
     assert solution.status.tolist() == [Status.SOLVED, Status.CONTINUED, Status.SOLVED]
-    assert solution.fallbacks.tolist() == [[0, 0, 0], [1, 1, 0], [0, 0, 0]]
+    assert solution.fallbacks.tolist() == [[0, 0, 0, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
     for k in (0, 2):
         assert torch.equal(solution.q[k], alone.q[k])
         for name in ("residual_norm", "iterations", "evaluations"):
@@ -130,7 +130,7 @@ def test_failure_is_reported() -> None:
     before = len(objective.calls)
     solution = Fallbacks(brief, brief).solve(objective, torch.tensor([3.0], dtype=torch.float64))
     assert int(solution.status) in (Status.STALLED, Status.ITERATION_LIMIT)
-    assert solution.fallbacks.tolist() == [1, 2, 0]
+    assert solution.fallbacks.tolist() == [1, 2, 0, 0]
     assert float(solution.residual_norm) <= float(first.residual_norm)
     assert float(solution.residual_norm) == pytest.approx(float(solution.q) ** 2 + 1, rel=1e-12)
     assert int(solution.evaluations) == len(objective.calls) - before
@@ -147,7 +147,7 @@ def test_worse_end_of_a_detour_is_dropped() -> None:
     solution = Fallbacks(SHORT, Descent(max_evaluations=1), detours=(WarmStart(),)).solve(objective, starts(3.0))
     for name in ("q", "status", "residual_norm"):
         assert torch.equal(getattr(solution, name), getattr(direct, name))
-    assert solution.fallbacks.tolist() == [[1, 0, 0]]
+    assert solution.fallbacks.tolist() == [[1, 0, 0, 0]]
     assert int(solution.evaluations) > int(direct.evaluations)
 
 
@@ -155,7 +155,7 @@ def test_non_finite_worlds_take_no_detour() -> None:
     """NaN at the start: NON_FINITE, and nothing else is tried."""
     solution = Fallbacks(SHORT, SHORT).solve(landing("wide"), starts(float("nan"), EASY))
     assert solution.status.tolist() == [Status.NON_FINITE, Status.SOLVED]
-    assert solution.fallbacks.tolist() == [[0, 0, 0], [0, 0, 0]]
+    assert solution.fallbacks.tolist() == [[0, 0, 0, 0], [0, 0, 0, 0]]
 
 
 def test_steps_that_a_short_search_cannot_solve() -> None:
@@ -228,8 +228,8 @@ def test_step_in_halves(longest: float, halved: int) -> None:
     assert solver.asked == pytest.approx([DT, *parts])
     assert solution.status.tolist() == [Status.SOLVED, Status.HALVED, Status.SOLVED]
     assert unhelped.status.tolist() == [Status.SOLVED, Status.STALLED, Status.SOLVED]
-    assert solution.fallbacks.tolist() == [[0, 0, 0], [0, 0, halved], [0, 0, 0]]
-    assert unhelped.fallbacks.tolist() == [[0, 0, 0]] * 3
+    assert solution.fallbacks.tolist() == [[0, 0, 0, 0], [0, 0, 0, halved], [0, 0, 0, 0]]
+    assert unhelped.fallbacks.tolist() == [[0, 0, 0, 0]] * 3
     for k in (0, 2):
         assert torch.equal(after.q[k], expected.q[k])
         assert torch.equal(after.q_previous[k], expected.q_previous[k])
@@ -268,7 +268,7 @@ def test_halving_that_does_not_help() -> None:
     assert torch.equal(after.q, expected.q)
     assert torch.equal(after.q_previous, expected.q_previous)
     assert torch.equal(solution.residual_norm, unhelped.residual_norm)
-    assert solution.fallbacks.tolist() == [[0, 0, 0], [0, 0, 2], [0, 0, 0]]
+    assert solution.fallbacks.tolist() == [[0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 0]]
 
 
 def test_halves_are_never_shorter_than_the_shortest_step() -> None:
@@ -279,7 +279,7 @@ def test_halves_are_never_shorter_than_the_shortest_step() -> None:
     state = simulator.initial_state(*thrown(simulator))
     _, solution = simulator.step(state)
     assert solution.status.tolist() == [Status.SOLVED, Status.STALLED, Status.SOLVED]
-    assert solution.fallbacks.tolist() == [[0, 0, 0]] * 3
+    assert solution.fallbacks.tolist() == [[0, 0, 0, 0]] * 3
 
 
 def test_guess_is_tried_after_all() -> None:
@@ -296,7 +296,7 @@ def test_guess_is_tried_after_all() -> None:
     assert int(solution.status) == Status.SOLVED
     assert torch.equal(solution.q, alone.q)
     assert int(solution.evaluations) == 8 + int(alone.evaluations)
-    assert solution.fallbacks.tolist() == [0, 0, 0]
+    assert solution.fallbacks.tolist() == [0, 0, 0, 0]
     once = Descent(max_evaluations=1)
     assert int(Fallbacks(once, once, detours=()).solve(objective, guess).evaluations) == 1
 
@@ -313,5 +313,5 @@ def test_halved_steps_of_a_chain() -> None:
         state, solution = helped.step(state)
         seen |= set(solution.status.tolist())
         assert bool(torch.isfinite(state.q).all())
-        assert bool(unhelped.solved.all()) == (int(solution.fallbacks[0, 2]) == 0)
+        assert bool(unhelped.solved.all()) == (int(solution.fallbacks[0, 3]) == 0)
     assert int(Status.HALVED) in seen

@@ -83,7 +83,7 @@ def test_root_is_found(name: str, dtype: torch.dtype, problem: Problem) -> None:
     assert solution.q.dtype == dtype
     assert bool(torch.isfinite(solution.q).all())
     assert float(torch.linalg.vector_norm(residual)) == pytest.approx(float(solution.residual_norm), rel=1e-6, abs=1e-12)
-    assert solution.fallbacks.tolist() == [0, 0, 0]
+    assert solution.fallbacks.tolist() == [0, 0, 0, 0]
     assert solution.lanes == int(solution.evaluations)
     # the exact Hessian of ½‖r‖² evaluates r once more, but where the solver has arrived
     again = int(solution.evaluations) - int(solution.solved) if name == "LM on GE" else 0
@@ -119,7 +119,7 @@ def test_batch_of_guesses(name: str, problem: Problem) -> None:
     guess = problem.start(torch.float64)
     guesses = guess * (1 + 0.3 * torch.rand(2, 3, len(guess), dtype=torch.float64, generator=generator(1)))
     whole = method.solve(objective, guesses)
-    assert whole.fallbacks.shape == (2, 3, 3)
+    assert whole.fallbacks.shape == (2, 3, 4)
     for i in range(2):
         for j in range(3):
             assert_same(whole, (i, j), method.solve(objective, guesses[i, j]))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pbfd_torch.integrators.implicit_euler import State
+from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.kinematics import retract
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import chain_fixed, chain_ground
@@ -50,7 +50,7 @@ def scattered(setup: Setup, seed: int, bend: float = 0.1) -> tuple[Tensor, Tenso
     return q.to(setup.q.dtype), v.to(setup.q.dtype)
 
 
-def run(simulator: Simulator, q: Tensor, v: Tensor, steps: int) -> tuple[State, Solution]:
+def run(simulator: Simulator, q: Tensor, v: Tensor, steps: int) -> tuple[Positions, Solution]:
     """State after some steps, and all solutions stacked along a new first dimension."""
     state = simulator.initial_state(q, v)
     solutions = []
@@ -138,7 +138,7 @@ def test_batch_dimensions_are_only_a_shape() -> None:
 def test_same_run_twice() -> None:
     """Determinism: bitwise the same states and counts, from objects built anew."""
 
-    def once() -> tuple[State, Solution]:
+    def once() -> tuple[Positions, Solution]:
         setup = chain_ground(8)
         return run(Simulator(setup.scene, 0.02, solver=HASTY, halvings=1), *scattered(setup, 4), 10)
 

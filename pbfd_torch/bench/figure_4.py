@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.bench.timing import Progress, timed, worst
-from pbfd_torch.integrators.implicit_euler import State
+from pbfd_torch.integrators.integrator import State
 from pbfd_torch.kinematics import place
 from pbfd_torch.models.chains import LENGTH
 from pbfd_torch.models.setup import Setup

@@ -128,7 +128,9 @@ class Problem:
         # bends add up along the chain: this keeps the tip's height within some tenths of a millimetre for every n
         start = 0.01 / n**1.5 * bent
         self.q = start + 0.001 / n**1.5 * moved
-        state = simulator.integrator.start(a, start, moved / n**1.5, torch.zeros_like(moved), torch.tensor(DT, dtype=a.dtype))
+        state = simulator.integrator.start(
+            a, start, moved / n**1.5, lambda: torch.zeros_like(moved), torch.tensor(DT, dtype=a.dtype)
+        )
         self.balance: BalanceObjective = simulator.objective(state)
         self.energy: EnergyObjective = self.balance.lagged(start)
         self.squared = Squared(self.balance)

@@ -8,10 +8,13 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.integrator import Integrator as Scheme
+from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES, Setup, file_setup
 from pbfd_torch.simulator import Solver
 from pbfd_torch.solvers.descent import Descent
@@ -28,6 +31,9 @@ CALIBRATION_SPEED = 1.0  # [m/s] at which the PBFD law's C∥ gives the scene's 
 
 class Integrator(enum.StrEnum):
     IMPLICIT_EULER = "implicit-euler"
+    BDF2 = "bdf2"
+    VARIATIONAL = "variational"
+    ENERGY_MOMENTUM = "energy-momentum"
 
 
 class SolverChoice(enum.StrEnum):
@@ -95,6 +101,9 @@ class Choices:
             raise InputError(f"--workers is {self.workers}: must be 1 with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
             raise InputError(f"--solver is {self.solver.value}: must be one of the jtj-lm with --schedule asynchronous")
+
+    def make_integrator(self) -> Scheme[Any]:
+        return INTEGRATORS[self.integrator.value]()
 
     def make_solver(self) -> Solver:
         return _SOLVERS[self.solver]()

@@ -61,6 +61,7 @@ class Result:
             "unsolved_steps": int((~r.solved).sum()),
             "warm_started_steps": int((r.status == int(Status.WARM_STARTED)).sum()),
             "continued_steps": int((r.status == int(Status.CONTINUED)).sum()),
+            "eased_steps": int((r.status == int(Status.EASED)).sum()),
             "halved_steps": int((r.status == int(Status.HALVED)).sum()),
             "candidates_dropped_steps": int((r.hazards & int(Hazard.CANDIDATES_DROPPED)).bool().sum()),
             "moved_too_far_steps": int((r.hazards & int(Hazard.MOVED_TOO_FAR)).bool().sum()),
@@ -107,7 +108,7 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     if steps > MAX_STEPS:
         raise InputError(f"--duration {duration} s at --dt {dt} s makes {steps} steps: must be at most {MAX_STEPS}")
     setup = with_friction(setup, choices.friction, dt)
-    simulator = Simulator(setup.scene, dt, solver=choices.make_solver())
+    simulator = Simulator(setup.scene, dt, choices.make_integrator(), choices.make_solver())
     controls = setup.controls(steps)
     if choices.workers > setup.worlds:
         raise InputError(f"--workers is {choices.workers}: must be at most the number of worlds, {setup.worlds}")

@@ -75,6 +75,7 @@ class Actuators:
     damping: Tensor
     control_range: Tensor  # [nu, 2]
     force_range: Tensor  # [nu, 2]
+    share: Tensor | None = None  # where in the step the coordinate is taken that the stiffness answers; None: at its end
 
     @staticmethod
     def from_list(articulation: Articulation, actuators: Sequence[Actuator]) -> Actuators:
@@ -136,7 +137,22 @@ class Actuators:
             damping=worlds.pick(self.damping, 1),
             control_range=worlds.pick(self.control_range, 2),
             force_range=worlds.pick(self.force_range, 2),
+            share=None if self.share is None else worlds.pick(self.share, 1),
         )
+
+    def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
+        """∂r/∂q of all joints within the force ranges `[*, nv]`."""
+        of_each = self.gear * self.gear * (self.stiffness + self.damping / dt[..., None])
+        return (of_each[..., None, :] @ _spread(self.dof, articulation, of_each.dtype)).squeeze(-2)
+
+    def taken_at(self, share: Tensor) -> Self:
+        """The same actuators, whose stiffness answers the coordinates at the share θ `[*, nv]` of the step."""
+        return replaced(self, share=share[..., self.dof])
+
+    @property
+    def _yield(self) -> Tensor:
+        """How the force falls over the step with its coordinate but for the damping."""
+        return self.stiffness if self.share is None else self.share * self.stiffness
 
     def prepare(self, step: StepContext) -> PreparedActuators:
         if step.control is None:
@@ -146,17 +162,17 @@ class Actuators:
         else:
             control = step.control
         drive = self.gain * _clamped(control, self.control_range) + self.bias
-        spread = (self.dof[:, None] == torch.arange(step.previous.articulation.nv, device=self.dof.device)).to(self.gear.dtype)
+        spread = _spread(self.dof, step.previous.articulation, self.gear.dtype)
         return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate], spread)
 
     def load(self, prepared: PreparedActuators, placement: Placement) -> JointLoad:
-        x = self.gear * placement.q[..., self.coordinate]
-        damping = self.damping * prepared.inverse_dt
-        force = prepared.drive - self.stiffness * x - damping * (x - prepared.previous)
+        moved = self.gear * placement.q[..., self.coordinate] - prepared.previous
+        fall = self._yield + self.damping * prepared.inverse_dt
+        force = prepared.drive - self.stiffness * prepared.previous - fall * moved
         low, high = self.force_range.unbind(-1)
         inside = (force > low) & (force < high)
         force = _clamped(force, self.force_range)
-        slope = torch.where(inside, self.stiffness + damping, torch.zeros_like(force)) * self.gear * self.gear
+        slope = torch.where(inside, fall, torch.zeros_like(force)) * self.gear * self.gear
         spread = prepared.spread.expand(*placement.q.shape[:-1], *prepared.spread.shape)
         residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
         return JointLoad(residual, lambda: torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
@@ -166,7 +182,7 @@ class Actuators:
         straight line of slope −g, g = stiffness + damping/Δt, and f = clamp(F): the integral over Δx = x − x_n is, with values at
         x_n marked by a zero, ½ (f − f₀)(F − f + F₀ − f₀)/g − ½ (f + f₀) Δx. Without limits only the second part is left."""
         moved = self.gear * placement.q[..., self.coordinate] - prepared.previous
-        slope = self.stiffness + self.damping * prepared.inverse_dt
+        slope = self._yield + self.damping * prepared.inverse_dt
         first = prepared.drive - self.stiffness * prepared.previous
         last = first - slope * moved
         limited_first, limited_last = _clamped(first, self.force_range), _clamped(last, self.force_range)
@@ -179,3 +195,8 @@ def _clamped(value: Tensor, bounds: Tensor) -> Tensor:
     """The value within bounds `[nu, 2]`."""
     low, high = bounds.unbind(-1)
     return torch.maximum(torch.minimum(value, high), low)
+
+
+def _spread(dof: Tensor, articulation: Articulation, dtype: torch.dtype) -> Tensor:
+    """`[nu, nv]` 1 where the actuator drives the degree of freedom."""
+    return (dof[:, None] == torch.arange(articulation.nv, device=dof.device)).to(dtype)

@@ -256,6 +256,10 @@ class BodyContact:
         """As `Contact.softened`."""
         return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))
 
+    def push(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
+        """See `Pushing`."""
+        return self.force(prepared, placement).push.sum(-1)
+
     def points(self, prepared: PreparedBodyContact, placement: Placement) -> ContactPoints:
         """The contacts at a placement that ends the prepared step; forces are on the first bodies."""
         contact = self.force(prepared, placement)

@@ -325,6 +325,10 @@ class Contact:
         """The same contact with C⊥ scaled by `factor`; the friction law follows the normal force."""
         return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))
 
+    def push(self, prepared: PreparedContact, placement: Placement) -> Tensor:
+        """See `Pushing`."""
+        return self.force(prepared, placement).push.sum(-1)
+
     def points(self, prepared: PreparedContact, placement: Placement) -> ContactPoints:
         """The contacts at a placement that ends the prepared step."""
         contact = self.force(prepared, placement)

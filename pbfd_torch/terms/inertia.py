@@ -1,4 +1,10 @@
-"""Inertia and gravity of the links (Eq. 5), integrated analytically over each body."""
+"""Inertia and gravity of the links (Eq. 5), integrated analytically over each body.
+
+The links' pseudo-inertias are pulled to the integrator's target poses T̂, which hold gravity: D = T − T̂. What the pull does to a
+degree of freedom is its virtual work along ∂T/∂θ_i = ŝ_i T. The paper takes that at the end of the step, where it is the gradient
+of κ/2 Σ tr(D S Dᵀ). Taken on the chord between the start (w = 0) and the end (w = 1) of the step it is no gradient of anything,
+but keeps what the paper's loses: at w = 0 it is a variational integrator's, at w = ½ energy and momentum are conserved.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +14,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.kinematics import Chord, Placement
 from pbfd_torch.rotations import skew
-from pbfd_torch.terms.load import LinkLoad, StepContext
+from pbfd_torch.terms.load import ChordLoad, LinkLoad, StepContext
 from pbfd_torch.worlds import Worlds
 
 
@@ -18,20 +24,31 @@ from pbfd_torch.worlds import Worlds
 class PreparedInertia:
     weight: Tensor  # κ, shaped to multiply [*batch, nlink, 4, 4]
     target: Tensor
+    start: Placement
+    share: Tensor | None  # w, [*batch]; None: 1
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """I(θ) = κ/2 Σ tr(D S Dᵀ), D = T − T̂: the links' pseudo-inertias pulled to the integrator's target poses, which hold
-    gravity."""
+    """r_i = κ Σ tr(D S (ŝ_i T)ᵀ), with ŝ_i T taken where the integrator says (`StepContext.share`)."""
 
     def prepare(self, step: StepContext) -> PreparedInertia:
-        return PreparedInertia(step.weight[..., None, None, None], step.target_poses)
+        return PreparedInertia(step.weight[..., None, None, None], step.target_poses, step.previous, step.share)
 
-    def load(self, prepared: PreparedInertia, placement: Placement) -> LinkLoad:
-        weighted = (placement.poses @ (prepared.weight * placement.articulation.pseudo_inertia)).mT
+    def load(self, prepared: PreparedInertia, placement: Placement) -> LinkLoad | ChordLoad:
+        inertia = prepared.weight * placement.articulation.pseudo_inertia
         lag = (placement.poses - prepared.target)[..., :3, :]
-        return LinkLoad(lag @ weighted, lambda: inertia_stiffness(placement.poses @ weighted))
+        weighted = (placement.poses @ inertia).mT
+        if prepared.share is None:
+            return LinkLoad(lag @ weighted, lambda: inertia_stiffness(placement.poses @ weighted))
+        chord = Chord(prepared.start, placement, prepared.share)
+        on_chord = (chord.poses @ inertia).mT
+        return ChordLoad(
+            chord,
+            moment=lag @ on_chord,
+            stiffness=lambda: inertia_stiffness(placement.poses @ on_chord),
+            moment_at_end=lambda: lag @ weighted,
+        )
 
     def take(self, worlds: Worlds) -> Self:
         """Itself: the masses are the articulation's."""
@@ -43,10 +60,11 @@ class Inertia:
 
 
 def inertia_stiffness(second: Tensor) -> Tensor:
-    """6×6 spatial inertia about the world origin, `[*, 4, 4]` (T S Tᵀ) → `[*, 6, 6]` in the order (ω, v)."""
+    """How the wrench on masses m at points q answers a twist of points p that they are tied to, from Σ m p̄ q̄ᵀ `[*, 4, 4]`:
+    `[*, 6, 6]` in the order (ω, v). With p = q (T S Tᵀ) it is the spatial inertia about the world origin."""
     m = second[..., :3, :3]
     trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     eye = torch.eye(3, dtype=m.dtype, device=m.device)
-    cross = skew(second[..., :3, 3])
     mass = second[..., 3:, 3:] * eye
-    return torch.cat((torch.cat((trace * eye - m, cross), -1), torch.cat((-cross, mass), -1)), -2)
+    top = torch.cat((trace * eye - m, skew(second[..., 3, :3])), -1)
+    return torch.cat((top, torch.cat((-skew(second[..., :3, 3]), mass), -1)), -2)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement, difference
+from pbfd_torch.kinematics import Placement, difference, retract
 from pbfd_torch.rotations import log_jacobian_symmetric
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
@@ -50,6 +50,7 @@ def elastic_load(articulation: Articulation, coefficient: Tensor, rest: Tensor, 
 class PreparedPull:
     coefficient: Tensor
     rest: Tensor
+    start: Tensor | None = None  # the configuration at the start of the step
 
 
 class _Pull:
@@ -65,20 +66,41 @@ class _Pull:
 
 @dataclass(frozen=True, eq=False)
 class JointSprings(_Pull):
-    """Torque −k (q − rest). `stiffness` `[*, nv]` [N m/rad or N/m] ≥ 0, `rest` `[*, nq]`."""
+    """Torque −k (q − rest). `stiffness` `[*, nv]` [N m/rad or N/m] ≥ 0, `rest` `[*, nq]`. `share`: where in the step q is taken,
+    θ `[*, nv]` of its way; None: at its end."""
 
     stiffness: Tensor
     rest: Tensor
+    share: Tensor | None = None
 
     def __post_init__(self) -> None:
         require_non_negative("spring stiffness", self.stiffness)
 
     def prepare(self, step: StepContext) -> PreparedPull:
-        return PreparedPull(self.stiffness, self.rest)
+        return PreparedPull(self.stiffness, self.rest, step.previous.q)
+
+    def load(self, prepared: PreparedPull, placement: Placement) -> JointLoad:
+        """See `Term`."""
+        share = self.share
+        if share is None or prepared.start is None:
+            return super().load(prepared, placement)
+        articulation = placement.articulation
+        q = retract(articulation, prepared.start, share * difference(articulation, prepared.start, placement.q))
+        load = elastic_load(articulation, prepared.coefficient, prepared.rest, q)
+        return JointLoad(load.residual, lambda: load.stiffness * share[..., None, :])
+
+    def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
+        """∂r/∂q `[*, nv]`."""
+        return self.stiffness
+
+    def taken_at(self, share: Tensor) -> Self:
+        """The same springs at the share θ of the step."""
+        return replaced(self, share=share)
 
     def take(self, worlds: Worlds) -> Self:
         """The same springs with the values of some worlds."""
-        return replaced(self, stiffness=worlds.pick(self.stiffness, 1), rest=worlds.pick(self.rest, 1))
+        share = None if self.share is None else worlds.pick(self.share, 1)
+        return replaced(self, stiffness=worlds.pick(self.stiffness, 1), rest=worlds.pick(self.rest, 1), share=share)
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
@@ -96,6 +118,14 @@ class JointDamping(_Pull):
 
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.damping / step.dt[..., None], step.previous.q)
+
+    def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
+        """∂r/∂q `[*, nv]`."""
+        return self.damping / dt[..., None]
+
+    def taken_at(self, share: Tensor) -> Self:
+        """Itself: its impulse is the same wherever the coordinates are taken, −c times what they move by."""
+        return self
 
     def take(self, worlds: Worlds) -> Self:
         """The same damping with the coefficients of some worlds."""

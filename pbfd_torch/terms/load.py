@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.kinematics import Chord, Motion, Placement, place
 from pbfd_torch.worlds import Worlds
 
 
@@ -26,6 +26,8 @@ class StepContext:
         target_q: q̂ `[*batch, nq]`: where inertia pulls the joints' own rotors (armature).
         control: `[*batch, nu]` or None.
         time: [s] at the start, like dt.
+        share: w `[*batch]`, where on the chord from the start of the step to its end inertia does its virtual work; None: at
+            its end, as in the paper.
     """
 
     dt: Tensor
@@ -35,6 +37,7 @@ class StepContext:
     target_q: Tensor
     control: Tensor | None
     time: Tensor
+    share: Tensor | None = None
 
     def take(self, worlds: Worlds) -> StepContext:
         """The step of some worlds."""
@@ -47,6 +50,7 @@ class StepContext:
             target_q=worlds.pick(self.target_q, 1),
             control=None if self.control is None else worlds.pick(self.control, 1),
             time=worlds.pick(self.time, 0),
+            share=None if self.share is None else worlds.pick(self.share, 0),
         )
 
 
@@ -86,6 +90,28 @@ class LinkLoad:
         return self._coupling()
 
 
+class ChordLoad:
+    """Loads on links that do their virtual work on the chord of the step; smooth. The matrices are computed when first asked for.
+
+    chord: where. moment: `[*batch, nlink, 3, 4]` as of a `LinkLoad`, of points on the chord. stiffness: `[*batch, nlink, 6, 6]` how
+    the wrench on points on the chord answers a twist of the link at the chord's end. moment_at_end: the same forces' moment about
+    the points at the chord's end."""
+
+    def __init__(self, chord: Chord, moment: Tensor, stiffness: Callable[[], Tensor], moment_at_end: Callable[[], Tensor]) -> None:
+        self.chord = chord
+        self.moment = moment
+        self._stiffness = stiffness
+        self._moment_at_end = moment_at_end
+
+    @cached_property
+    def stiffness(self) -> Tensor:
+        return self._stiffness()
+
+    @cached_property
+    def moment_at_end(self) -> Tensor:
+        return self._moment_at_end()
+
+
 class JointLoad:
     """Loads on degrees of freedom: `residual` `[*batch, nv]`, minus the generalised force. The stiffness is computed when first
     asked for."""
@@ -100,7 +126,7 @@ class JointLoad:
         return self._stiffness()
 
 
-Load = LinkLoad | JointLoad
+Load = LinkLoad | ChordLoad | JointLoad
 
 
 class Term(Protocol):
@@ -125,6 +151,15 @@ class OneSided(Protocol):
 
     def softened(self, factor: float) -> Term:
         """The same term, `factor` times as stiff; works with what the original prepared."""
+        ...
+
+
+@runtime_checkable
+class Pushing(Protocol):
+    """A term that sets in abruptly when things meet."""
+
+    def push(self, prepared: Any, placement: Placement) -> Tensor:
+        """The sizes of its one-sided forces summed up [N] `[*batch]`, torques by the articulation's reach."""
         ...
 
 

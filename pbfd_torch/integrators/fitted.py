@@ -1,0 +1,83 @@
+"""Smooth loads on joints between the trapezoidal rule, which is accurate, and implicit Euler, which is calm when they are stiff."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation
+from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.kinematics import Placement
+from pbfd_torch.terms.load import JointLoad, StepContext, Term
+from pbfd_torch.worlds import Worlds, replaced
+
+
+@runtime_checkable
+class Fittable(Protocol):
+    """A term with smooth loads on joints that may be taken anywhere in the step."""
+
+    def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
+        """How its residual grows with each coordinate over a step, `[*batch, nv]`."""
+        ...
+
+    def taken_at(self, share: Tensor) -> Self:
+        """The same term at the coordinates q_n + θ (q − q_n), θ `[*, nv]`."""
+        ...
+
+    def prepare(self, step: StepContext) -> Any: ...
+
+    def load(self, prepared: Any, placement: Placement) -> JointLoad: ...
+
+    def take(self, worlds: Worlds) -> Self: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A term of which the share θ `[*, nv]` moves the bodies: by θ Δt² a over the step, a its acceleration, ½ being the trapezoidal
+    rule and 1 implicit Euler."""
+
+    term: Fittable
+    share: Tensor
+
+    def prepare(self, step: StepContext) -> Any:
+        return self.term.prepare(step)
+
+    def load(self, prepared: Any, placement: Placement) -> JointLoad:
+        load = self.term.load(prepared, placement)
+        return JointLoad(self.share * load.residual, lambda: self.share[..., None] * load.stiffness)
+
+    def early(self, prepared: Any, placement: Placement) -> JointLoad:
+        """2θ − 1 of the term: what moves the bodies as if its impulse came half a step before."""
+        load = self.term.load(prepared, placement)
+        ahead = 2 * self.share - 1
+        return JointLoad(ahead * load.residual, lambda: ahead[..., None] * load.stiffness)
+
+    def take(self, worlds: Worlds) -> Self:
+        """The same with the parameters of some worlds."""
+        return replaced(self, term=self.term.take(worlds), share=worlds.pick(self.share, 1))
+
+
+def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
+    """The terms, with those that can be `Fitted` to the stiffness z = Δt² (∂r/∂q)/m that all of them have together: m is what the
+    other joints, free to move, let each joint feel of its inertia in the rest configuration."""
+    able = [term for term in terms if isinstance(term, Fittable)]
+    if not able:
+        return terms
+    inertia = mass_matrix(articulation, articulation.rest, terms).detach()
+    felt = 1 / torch.linalg.inv(inertia).diagonal(dim1=-2, dim2=-1)
+    slope = sum((term.slope(articulation, dt).detach() for term in able), torch.zeros_like(felt))
+    share = fit((dt * dt)[..., None] * slope / felt)
+    turning = articulation.topology.turning_v.flatten()
+    share[..., turning] = 1.0  # where coordinates do not add up
+    return [Fitted(term.taken_at(share), share) if isinstance(term, Fittable) else term for term in terms]
+
+
+def fit(stiffness: Tensor) -> Tensor:
+    """θ(z) = 1/(1 − e^{−z}) − 1/z, from ½ at z = 0 to 1: with it a damped joint slows down by exactly e^{−z} in a step."""
+    small = stiffness < 1e-3
+    z = torch.where(small, torch.ones_like(stiffness), stiffness)
+    return torch.where(small, 0.5 + stiffness / 12, -1 / torch.expm1(-z) - 1 / z)
