@@ -41,11 +41,9 @@ class AsynchronousRollout:
     is not one-dimensional, and for controls of another shape."""
 
     def __init__(self, simulator: Simulator, state: State, steps: int, control: Tensor | Policy | None = None) -> None:
-        solver = simulator.solver
+        solver = simulator.first_solver
         self._fallbacks: Fallbacks | None
-        if isinstance(solver, Fallbacks) and simulator.integrator.easier:
-            self._direct, self._fallbacks = solver.first, None
-        elif isinstance(solver, Fallbacks):
+        if isinstance(solver, Fallbacks):
             self._direct, self._fallbacks = solver.direct, solver
         elif isinstance(solver, Descent):
             self._direct, self._fallbacks = solver, None
@@ -127,16 +125,15 @@ class AsynchronousRollout:
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
         # for all lanes, although most are not at the end: those that are, are not worth a scene of their own
         integrator = self._simulator.integrator
-        advanced = integrator.advance(self._objective, self._state, self._progress.q)
-        refused = integrator.refused(self._objective, self._state, advanced)
+        advanced, refused = integrator.advance(self._objective, self._state, self._progress.q)
         advanced = mapped(lambda x: x[index], advanced)
         refused = None if refused is None else refused[index]
-        if len(unsolved_worlds(found, refused)):
+        if len(unsolved_worlds(found)) or (refused is not None and bool(refused.any())):
             simulator = self._simulator.take(lanes)
             if self._fallbacks is not None:
                 objective = self._objective.take(index)
                 found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
-                advanced = integrator.advance(objective, state, found.q)
+                advanced, refused = integrator.advance(objective, state, found.q)
             advanced, found = simulator.finished(state, held, advanced, found, refused)
             self.lanes += found.lanes
         self._record(index, advanced, held, found)

@@ -18,6 +18,8 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import Placement, place, retract
 from pbfd_torch.outlook import Outlook
 from pbfd_torch.solvers.objective import Evaluation, weighted_error
+from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import (
     Aftermath,
     Frictional,
@@ -68,8 +70,8 @@ class BalanceObjective:
 
     @property
     def guess(self) -> Tensor:
-        """`[*batch, nq]` where inertia alone would end the step."""
-        return self.step.target_q
+        """`[*batch, nq]` where the integrator expects the step to end."""
+        return self.step.target_q if self.step.guess is None else self.step.guess
 
     def loads(self, placement: Placement) -> list[Load]:
         """Every term's load at a placement."""
@@ -156,6 +158,16 @@ class BalanceObjective:
             if isinstance(term, Hazardous):
                 hazards = hazards | term.hazards(prepared, placement)
         return Aftermath(tuple(memory), hazards)
+
+    def forces(self, q: Tensor) -> Tensor:
+        """Everything but inertia at the end of a step, `[*batch, nv]`."""
+        placement = place(self.articulation, q)
+        loads = [
+            term.load(prepared, placement)
+            for term, prepared in zip(self.terms, self.prepared, strict=True)
+            if not isinstance(term, Inertia | Armature)
+        ]
+        return -Balance(placement, loads).residual
 
     def push(self, q: Tensor) -> Tensor:
         """How hard contacts and limits push in all at the end of a step, in weights of the articulation, `[*batch]`."""

@@ -62,6 +62,7 @@ class Recorder:
             "residual_norm": solution.residual_norm,
             "fallbacks": solution.fallbacks,
             "hazards": state.hazards,
+            "substeps": torch.ones_like(solution.status) if solution.steps is None else solution.steps,
         }
         pairs = zip(objective.terms, objective.prepared, strict=True)
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]

@@ -40,6 +40,7 @@ class Rollout:
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
         fallbacks: `[T, *batch, 4]` int, how often each of `FALLBACKS` was tried.
         hazards: `[T, *batch]` int, `Hazard` bits: what may be wrong with a step although it was solved.
+        substeps: `[T, *batch]` int, steps that each world has made in it; 1 unless worlds choose their steps themselves.
         lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
             `[T, *batch, npoint, 3]` on the body.
@@ -64,6 +65,7 @@ class Rollout:
     residual_norm: Tensor
     fallbacks: Tensor
     hazards: Tensor
+    substeps: Tensor
     lanes: Tensor
     contact_point: Tensor
     contact_depth: Tensor

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, cast
+from typing import Generic, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -16,15 +16,16 @@ from pbfd_torch.articulation import Articulation, force_scale
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
-from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
+from pbfd_torch.dynamics import bias_force, kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.errors import ContactOverflowError, InputError, ModelError
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.integrator import Integrator, S, Trial
 from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.solvers.fallbacks import Fallbacks, merged
+from pbfd_torch.solvers.fallbacks import Fallbacks, brisk, merged
 from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.actuators import Actuators
@@ -128,7 +129,7 @@ class Simulator(Generic[S]):
         a = scene.articulation
         self.scene = scene
         self.dt = float(dt)
-        self.integrator: Integrator[S] = integrator or cast(Integrator[S], ImplicitEuler())
+        self.integrator: Integrator[S] = integrator or cast(Integrator[S], EnergyMomentum())
         self.solver: Solver = solver or Fallbacks()
         self.halvings = halvings
         self.step_size = torch.tensor(dt, dtype=a.dtype, device=a.device)
@@ -139,34 +140,38 @@ class Simulator(Generic[S]):
 
     @property
     def first_solver(self) -> Solver:
-        """What a step is given to first: no detours where there is an easier step."""
-        if self.integrator.easier and isinstance(self.solver, Fallbacks):
-            return self.solver.first
-        return self.solver
+        """What a step is given to first: no long detours where there is an easier step."""
+        return brisk() if self.integrator.easier and isinstance(self.solver, Fallbacks) else self.solver
 
     def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).
         One configuration goes to all worlds where the velocity, gravity or the articulation's parameters have several.
 
-        The start is of second order. Integrators that keep positions take the acceleration from a trial step, so stiff contacts are
-        felt as they will be; a world whose trial step does not solve starts at first order. Raises `InputError` for wrong shapes,
-        dtypes, devices or NaN."""
+        The start is of second order, or of first order in a world whose trial step is unsolved, if the integrator needs one. Raises
+        `InputError` for wrong shapes, dtypes, devices or NaN."""
         a = self.scene.articulation
         q = a.rest if q is None else self._checked(q, a.nq, "q")
         v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
         batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
         q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
         q = a.topology.normalized(q)
-        start = self.integrator.start(a, q, v, lambda: self._acceleration(q, v, control), self.step_size)
+        start = self.integrator.start(self, q, v, control)
         return replaced(start, memory=blank_memory(self.scene.terms, tuple(batch)))
 
-    def _acceleration(self, q: Tensor, v: Tensor, control: Tensor | None) -> Tensor:
-        """Of a trial step of implicit Euler that sets out with v."""
-        a, scheme = self.scene.articulation, ImplicitEuler()
-        trial = Simulator(self.scene, self.dt, scheme, self.solver, self.halvings)
-        end, solution = trial.step(scheme.start(a, q, v, lambda: torch.zeros_like(v), self.step_size), control)
-        gained = scheme.velocity(a, end, self.step_size) - v
-        return torch.where(solution.solved[..., None], gained / self.step_size, 0.0)
+    @property
+    def articulation(self) -> Articulation:
+        return self.scene.articulation
+
+    def trial(self, q: Tensor, v: Tensor, control: Tensor | None) -> Trial:
+        """A step of implicit Euler from q `[*batch, nq]` with v `[*batch, nv]`."""
+        a, scheme = self.articulation, ImplicitEuler()
+        simulator = Simulator(self.scene, self.dt, scheme, self.solver, self.halvings)
+        start = scheme.at_rate(a, q, v, torch.zeros_like(v), self.step_size)
+        end, solution = simulator.step(start, control)
+        force = simulator.objective(start, control).forces(end.q) - bias_force(a, q, v, self.scene.gravity)
+        acceleration, _ = torch.linalg.solve_ex(mass_matrix(a, q, self.scene.terms), force[..., None])
+        solved = solution.solved
+        return Trial(end.q, torch.where(solved[..., None], acceleration.squeeze(-1), 0.0), solved)
 
     def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
         a = self.scene.articulation
@@ -194,8 +199,7 @@ class Simulator(Generic[S]):
         with torch.no_grad():
             objective = self.objective(state, control)
             solution = self.first_solver.solve(objective, objective.guess, state.q)
-            advanced = self.integrator.advance(objective, state, solution.q)
-            refused = self.integrator.refused(objective, state, advanced)
+            advanced, refused = self.integrator.advance(objective, state, solution.q)
             return *self.finished(state, control, advanced, solution, refused), objective
 
     def finished(
@@ -203,18 +207,31 @@ class Simulator(Generic[S]):
     ) -> tuple[S, Solution]:
         """The state after a step that the solver has left at `solution`, from which the integrator would go on to `advanced`:
         worlds that are unsolved or refused try easier steps, and those that still are unsolved shorter ones."""
-        index = unsolved_worlds(solution, refused)
-        for easier in self.integrator.easier:
+        if refused is not None:
+            status = torch.where(refused & solution.solved, int(Status.STALLED), solution.status)
+            solution = dataclasses.replace(solution, status=status.to(torch.int32))
+        easier = self.integrator.easier
+        index = unsolved_worlds(solution)
+        if len(index) and easier and self._may_halve(1):
+            index = index[self.integrator.halves(self.objective(state, control), solution.q).reshape(-1)[index]]
+            if len(index):
+                advanced, solution = self._halved(state, control, advanced, solution, index, 2)
+        for k, scheme in enumerate(easier):
+            index = unsolved_worlds(solution)
             if len(index) == 0:
                 break
-            advanced, solution = self._eased(state, control, advanced, solution, index, easier)
-            index = unsolved_worlds(solution)
+            # detours for the last one only: what comes before is tried for its accuracy
+            solver = self.solver if k == len(easier) - 1 else self.first_solver
+            advanced, solution = self._eased(state, control, advanced, solution, index, scheme, solver)
         for halvings in range(1, self.halvings + 1):
             index = unsolved_worlds(solution)
-            if len(index) == 0 or self.dt / 2**halvings < SHORTEST_STEP:
+            if len(index) == 0 or not self._may_halve(halvings):
                 break
             advanced, solution = self._halved(state, control, advanced, solution, index, 2**halvings)
         return advanced, solution
+
+    def _may_halve(self, times: int) -> bool:
+        return times <= self.halvings and self.dt / 2**times >= SHORTEST_STEP
 
     def take(self, worlds: Worlds) -> Simulator[S]:
         """The simulator of some worlds."""
@@ -222,24 +239,45 @@ class Simulator(Generic[S]):
         part.scene = self.scene.take(worlds)
         part._terms = [term.take(worlds) for term in self._terms]
         part._scale = worlds.pick(self._scale, 1)
+        part.step_size = worlds.pick(self.step_size, 0)
         part._batch = torch.Size(()) if len(self._batch) == 0 else worlds.index.shape
         return part
 
+    def sized(self, step_size: Tensor) -> Simulator[S]:
+        """The same simulator with steps [s] of another length, or of one for each world `[*batch]`."""
+        return self._as(self.integrator, self.solver, self.halvings, step_size)
+
+    def _as(self, integrator: Integrator[S], solver: Solver, halvings: int, step_size: Tensor) -> Simulator[S]:
+        other = copy.copy(self)
+        other.integrator, other.solver, other.halvings = integrator, solver, halvings
+        other.step_size, other.dt = step_size, float(step_size.min())
+        other._terms = integrator.adapted(self.articulation, self.scene.terms, step_size)
+        return other
+
     def _eased(
-        self, state: S, control: Tensor | None, advanced: S, solution: Solution, index: Tensor, easier: Integrator[S]
+        self,
+        state: S,
+        control: Tensor | None,
+        advanced: S,
+        solution: Solution,
+        index: Tensor,
+        easier: Integrator[S],
+        solver: Solver,
     ) -> tuple[S, Solution]:
-        """The step of the worlds at `index` again, as one of another integrator. Unsolved worlds keep the result in any case,
-        refused ones if it is solved."""
+        """The step of the worlds at `index` again, as one of another integrator; they keep the result whether it is solved or
+        not."""
         worlds = Worlds(state.q.shape[:-1], index)
-        other = Simulator(self.scene.take(worlds), self.dt, easier, self.solver, halvings=0)
+        part = self.take(worlds)
+        other = part._as(easier, solver, 0, part.step_size)
         before, held = state.take(worlds), None if control is None else worlds.pick(control, 1)
         objective = other.objective(before, held)
         found = other.solver.solve(objective, objective.guess, before.q)
-        kept = found.solved | ~solution.solved.reshape(-1)[index]
-        unsolved = torch.where(solution.solved, solution.residual_norm, math.inf)
-        solution = dataclasses.replace(solution, residual_norm=unsolved)
-        result = merged(solution, index, [found], FALLBACKS.index("easier step"), Status.EASED)
-        return _put(advanced, other.integrator.advance(objective, before, found.q), worlds, kept), result
+        lost = torch.where(solution.solved, solution.residual_norm, math.inf)
+        result = merged(
+            dataclasses.replace(solution, residual_norm=lost), index, [found], FALLBACKS.index("easier step"), Status.EASED
+        )
+        eased, _ = other.integrator.advance(objective, before, found.q)
+        return put(advanced, eased, worlds, torch.isfinite(found.residual_norm)), result
 
     def _halved(
         self, state: S, control: Tensor | None, advanced: S, solution: Solution, index: Tensor, parts: int
@@ -247,8 +285,9 @@ class Simulator(Generic[S]):
         """The step of the worlds at `index` again, as `parts` shorter ones; a world keeps the result if all of them solve. It then
         goes on with the velocity of the last one."""
         worlds = Worlds(state.q.shape[:-1], index)
-        short = Simulator(self.scene.take(worlds), self.dt / parts, self.integrator, self.solver, halvings=0)
-        now = self.integrator.resized(short.scene.articulation, state.take(worlds), self.step_size, short.step_size)
+        part = self.take(worlds)
+        short = part._as(self.integrator, self.solver, 0, part.step_size / parts)
+        now = self.integrator.resized(short.scene.articulation, state.take(worlds), part.step_size, short.step_size)
         held = None if control is None else worlds.pick(control, 1)
         climbs: list[Solution] = []
         hazards = torch.zeros_like(now.hazards)
@@ -257,14 +296,14 @@ class Simulator(Generic[S]):
             hazards = hazards | now.hazards
             climbs.append(climb)
         now = replaced(now, hazards=hazards)
-        end = self.integrator.resized(short.scene.articulation, now, short.step_size, self.step_size)
+        end = self.integrator.resized(short.scene.articulation, now, short.step_size, part.step_size)
         solved = torch.stack([x.solved for x in climbs]).all(0)
         worst = torch.stack([x.residual_norm for x in climbs]).amax(0)
         failed = torch.where(solved, climbs[-1].status, int(Status.STALLED))
         # an unfinished chain of short steps is no better end of the whole step, whatever its own residual
         climbs[-1] = dataclasses.replace(climbs[-1], status=failed, residual_norm=torch.where(solved, worst, math.inf))
         result = merged(solution, index, climbs, FALLBACKS.index("halving"), Status.HALVED)
-        return _put(advanced, end, worlds, solved), result
+        return put(advanced, end, worlds, solved), result
 
     def rollout(
         self,
@@ -306,14 +345,17 @@ class Simulator(Generic[S]):
         return len(controls)
 
 
-def _put(state: S, part: S, worlds: Worlds, kept: Tensor) -> S:
-    """The state with that of some worlds replaced by `part`, where `kept` `[n]`."""
+T = TypeVar("T")
 
-    def put(old: Tensor, new: Tensor) -> Tensor:
+
+def put(whole: T, part: T, worlds: Worlds, kept: Tensor) -> T:
+    """Values of a batch with those of some worlds replaced by `part`, where `kept` `[n]`: tensors, or states made of them."""
+
+    def write(old: Tensor, new: Tensor) -> Tensor:
         rows = old.reshape(math.prod(worlds.batch), *old.shape[len(worlds.batch) :])
         before = rows[worlds.index]
         chosen = torch.where(kept.reshape(-1, *(1,) * (rows.ndim - 1)), new.reshape(before.shape), before)
         return rows.index_copy(0, worlds.index, chosen).reshape(old.shape)
 
-    result: S = mapped(put, state, part)
+    result: T = mapped(write, whole, part)
     return result

@@ -15,7 +15,7 @@ class Status(enum.IntEnum):
     """How one world's solve ended."""
 
     SOLVED = 0
-    WARM_STARTED = 1  # solved, from the minimiser of the energy with lagged friction
+    WARM_STARTED = 1  # solved, from a minimiser: of the energy with lagged friction, or of ½‖r‖²
     CONTINUED = 2  # solved, by continuation in the friction's width or in stiffness
     EASED = 3  # solved, but as a step of another integrator, which is easier
     HALVED = 4  # solved, as two or more shorter steps
@@ -130,6 +130,7 @@ class Solution:
     iterations: `[*batch]` int, steps taken.
     evaluations: `[*batch]` int, evaluations of the residual spent.
     fallbacks: `[*batch, 4]` int, how often each of `FALLBACKS` was tried.
+    steps: `[*batch]` int, steps of a world that chooses their length itself; None: one for all.
     lanes: evaluations that the schedule spent on all worlds together, those on finished worlds included.
     """
 
@@ -139,6 +140,7 @@ class Solution:
     iterations: Tensor
     evaluations: Tensor
     fallbacks: Tensor
+    steps: Tensor | None = None
     lanes: int = 0
 
     @property
@@ -147,8 +149,6 @@ class Solution:
         return is_solved(self.status)
 
 
-def unsolved_worlds(solution: Solution, refused: Tensor | None = None) -> Tensor:
-    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved or refused, but from a finite
-    start."""
-    wanting = ~solution.solved if refused is None else ~solution.solved | refused
-    return (wanting & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+def unsolved_worlds(solution: Solution) -> Tensor:
+    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start."""
+    return (~solution.solved & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)

@@ -229,7 +229,7 @@ def test_actuator_force(pair: Pair) -> None:
     dt = torch.tensor(1e-3, dtype=torch.float64)
     previous = place(articulation, retract(articulation, pair.q, -dt * pair.v))
     placement = place(articulation, pair.q)
-    prepared = actuators.prepare(StepContext(dt, previous, dt, placement.poses, pair.q, control, 0 * dt))
+    prepared = actuators.prepare(StepContext(dt, previous, dt, placement.poses, pair.q, control, 0 * dt, torch.zeros(3)))
     assert_close(-actuators.load(prepared, placement).residual, np.stack([d.qfrc_actuator for d in states]))
 
 

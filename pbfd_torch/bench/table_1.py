@@ -13,6 +13,7 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.bench.timing import Progress, exponent, fit_sizes, timed, worst
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models.chains import GRAVITY, RADIUS, STIFFNESS, chain_colliders, chain_links
 from pbfd_torch.objective import BalanceObjective, EnergyObjective
 from pbfd_torch.simulator import Scene, Simulator
@@ -122,15 +123,14 @@ class Problem:
         if contact:
             ground = HalfSpace(offset=-RADIUS)
             terms.append(Contact.between(a, chain_colliders(n), ground, NormalForce(STIFFNESS), CoulombFriction(0.5)))
-        simulator = Simulator(Scene(a, terms, a.rest.new_tensor([0.0, 0.0, -GRAVITY])), DT)
+        scheme = ImplicitEuler()
+        simulator = Simulator(Scene(a, terms, a.rest.new_tensor([0.0, 0.0, -GRAVITY])), DT, scheme)
         generator = torch.Generator().manual_seed(0)
         bent, moved = (torch.randn(worlds, n, generator=generator, dtype=a.dtype) for _ in range(2))
         # bends add up along the chain: this keeps the tip's height within some tenths of a millimetre for every n
         start = 0.01 / n**1.5 * bent
         self.q = start + 0.001 / n**1.5 * moved
-        state = simulator.integrator.start(
-            a, start, moved / n**1.5, lambda: torch.zeros_like(moved), torch.tensor(DT, dtype=a.dtype)
-        )
+        state = scheme.at_rate(a, start, moved / n**1.5, torch.zeros_like(moved), simulator.step_size)
         self.balance: BalanceObjective = simulator.objective(state)
         self.energy: EnergyObjective = self.balance.lagged(start)
         self.squared = Squared(self.balance)

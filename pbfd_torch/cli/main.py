@@ -10,6 +10,9 @@ from typing import Annotated
 import typer
 
 from pbfd_torch.cli.bench_friction import friction
+from pbfd_torch.cli.bench_hard_cases import hard_cases
+from pbfd_torch.cli.bench_precision import precision
+from pbfd_torch.cli.bench_slope import slope
 from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
 from pbfd_torch.errors import NotModelledWarning, PbfdError
@@ -24,6 +27,9 @@ app = typer.Typer(
 bench = typer.Typer(no_args_is_help=True, help="Measures what the library does against the paper's claims.")
 bench.command()(solvers)
 bench.command()(friction)
+bench.command()(precision)
+bench.command()(hard_cases)
+bench.command()(slope)
 app.add_typer(bench, name="bench")
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)
@@ -35,7 +41,11 @@ def simulate(
     worlds: Annotated[int | None, typer.Option(help="Independent worlds in the batch; default: what the scene has.")] = None,
     duration: Annotated[float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")] = None,
     dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: the scene's.")] = None,
-    integrator: Annotated[Integrator, typer.Option(help="Time integrator.")] = Integrator.IMPLICIT_EULER,
+    accuracy: Annotated[
+        float | None,
+        typer.Option(help="Let every world choose its steps, each of which may be off by so much [m]; --dt: the longest one."),
+    ] = None,
+    integrator: Annotated[Integrator, typer.Option(help="Time integrator.")] = Integrator.ENERGY_MOMENTUM,
     solver: Annotated[
         SolverChoice, typer.Option(help="Solver; direct: without fallbacks; damped, lm, lbfgs: on ½‖r‖², as the paper has them.")
     ] = SolverChoice.JTJ_LM,
@@ -65,7 +75,7 @@ def simulate(
 
     use_threads(threads)
     free_base = None if fixed_base is None else not fixed_base
-    choices = Choices(integrator, solver, friction, dtype, device, seed, free_base, keyframe, schedule, workers)
+    choices = Choices(integrator, solver, friction, dtype, device, seed, free_base, keyframe, schedule, workers, accuracy)
     raise typer.Exit(run(load_setup(scene, worlds, choices), choices, duration, dt, out, as_json))
 
 

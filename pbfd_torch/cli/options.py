@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 
+from pbfd_torch.adaptive import AdaptiveSimulator
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.integrator import Integrator as Scheme
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES, Setup, file_setup
-from pbfd_torch.simulator import Solver
+from pbfd_torch.simulator import Scene, Simulator, Solver
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
@@ -83,7 +83,7 @@ _SOLVERS: dict[SolverChoice, Callable[[], Solver]] = {
 class Choices:
     """What the user chose, besides the scene, its length and where the result goes."""
 
-    integrator: Integrator = Integrator.IMPLICIT_EULER
+    integrator: Integrator = Integrator.ENERGY_MOMENTUM
     solver: SolverChoice = SolverChoice.JTJ_LM
     friction: Friction | None = None
     dtype: Dtype = Dtype.FLOAT64
@@ -93,8 +93,11 @@ class Choices:
     keyframe: str | None = None
     schedule: Schedule = Schedule.LOCK_STEP
     workers: int = 1
+    accuracy: float | None = None
 
     def __post_init__(self) -> None:
+        if self.accuracy is not None and self.schedule is Schedule.ASYNCHRONOUS:
+            raise InputError("--accuracy lets every world go at its own pace already: leave out --schedule asynchronous")
         if self.workers < 1:
             raise InputError(f"--workers is {self.workers}: must be ≥ 1")
         if self.schedule is Schedule.ASYNCHRONOUS and self.workers > 1:
@@ -102,11 +105,15 @@ class Choices:
         if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
             raise InputError(f"--solver is {self.solver.value}: must be one of the jtj-lm with --schedule asynchronous")
 
-    def make_integrator(self) -> Scheme[Any]:
-        return INTEGRATORS[self.integrator.value]()
-
     def make_solver(self) -> Solver:
         return _SOLVERS[self.solver]()
+
+    def make_simulator(self, scene: Scene, dt: float) -> Simulator[Any]:
+        """Raises `InputError` for a Δt or an accuracy out of range."""
+        integrator, solver = INTEGRATORS[self.integrator.value](), self.make_solver()
+        if self.accuracy is None:
+            return Simulator(scene, dt, integrator, solver)
+        return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver)
 
 
 def use_threads(count: int) -> None:

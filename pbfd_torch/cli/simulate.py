@@ -22,11 +22,11 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.hazards import Hazard
 from pbfd_torch.models import Setup
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.workers import Workers
 
 MAX_STEPS = 10_000_000
+FRAME = 0.05  # [s] of the records where worlds choose their own steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,8 @@ class Result:
             "dt": r.dt,
             "duration": duration,
             "steps": r.steps,
+            "accuracy": self.choices.accuracy,
+            "substeps_mean": float(r.substeps.sum(0).to(torch.float64).mean()),
             "integrator": self.choices.integrator.value,
             "solver": self.choices.solver.value,
             "dtype": self.choices.dtype.value,
@@ -99,7 +101,8 @@ def run(setup: Setup, choices: Choices, duration: float | None, dt: float | None
 def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt: float | None = None) -> Result:
     """Runs a setup with a progress bar on a terminal. Interrupted, it keeps the steps done."""
     duration = setup.duration if duration is None else duration
-    dt = setup.dt if dt is None else dt
+    if dt is None:
+        dt = setup.dt if choices.accuracy is None else min(FRAME, duration)
     if not (math.isfinite(duration) and duration > 0):
         raise InputError(f"--duration is {duration} s: must be > 0 and finite")
     if not (math.isfinite(dt) and 0 < dt <= duration):
@@ -108,7 +111,7 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     if steps > MAX_STEPS:
         raise InputError(f"--duration {duration} s at --dt {dt} s makes {steps} steps: must be at most {MAX_STEPS}")
     setup = with_friction(setup, choices.friction, dt)
-    simulator = Simulator(setup.scene, dt, choices.make_integrator(), choices.make_solver())
+    simulator = choices.make_simulator(setup.scene, dt)
     controls = setup.controls(steps)
     if choices.workers > setup.worlds:
         raise InputError(f"--workers is {choices.workers}: must be at most the number of worlds, {setup.worlds}")

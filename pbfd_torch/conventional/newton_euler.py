@@ -153,6 +153,7 @@ class NewtonEuler:
             target_q=coasting.q,
             control=control,
             time=state.time,
+            gravity=self.scene.gravity,
         )
 
     def step(self, state: VelocityState, control: Tensor | None = None) -> tuple[VelocityState, Solution]:

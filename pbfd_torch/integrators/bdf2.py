@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions, fallen
-from pbfd_torch.integrators.integrator import Integrator, State, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
 from pbfd_torch.kinematics import difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.load import StepContext, Term
@@ -46,12 +46,10 @@ class Bdf2:
         """The terms themselves, all implicit."""
         return terms
 
-    def start(
-        self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Callable[[], Tensor], dt: Tensor
-    ) -> FourPositions:
-        """A past of constant acceleration."""
-        unknown = torch.full_like(q[..., 0], torch.nan)
-        return FourPositions(**fresh(q), history=_past(articulation, q, v, acceleration(), dt), push=unknown)
+    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> FourPositions:
+        """A past of constant acceleration, that of a trial step."""
+        past = _past(stepper.articulation, q, v, stepper.trial(q, v, control).acceleration, stepper.step_size)
+        return FourPositions(**fresh(q), history=past, push=torch.full_like(q[..., 0], torch.nan))
 
     def velocity(self, articulation: Articulation, state: FourPositions, dt: Tensor) -> Tensor:
         """That of BDF2 at t_n."""
@@ -78,12 +76,19 @@ class Bdf2:
             target_q=retract(articulation, state.q, _extrapolated(*_moves(articulation, state))),
             control=control,
             time=state.time,
+            gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> FourPositions:
+    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> tuple[FourPositions, Tensor | None]:
         """See `Integrator`."""
         first, second, _ = state.history
-        return FourPositions(**after(objective, q), history=(state.q, first, second), push=objective.push(q))
+        push = objective.push(q)
+        end = FourPositions(**after(objective, q), history=(state.q, first, second), push=push)
+        return end, (push - state.push).abs() > self.jump
+
+    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
+        """None: an easier step is good enough."""
+        return torch.zeros_like(q[..., 0], dtype=torch.bool)
 
     def resized(self, articulation: Articulation, state: FourPositions, dt: Tensor, new: Tensor) -> FourPositions:
         """A past of constant acceleration, that of the last two steps."""
@@ -91,10 +96,6 @@ class Bdf2:
         acceleration = (last - before) / (dt * dt)[..., None]
         v = self.velocity(articulation, state, dt)
         return replaced(state, history=_past(articulation, state.q, v, acceleration, new))
-
-    def refused(self, objective: BalanceObjective, state: FourPositions, advanced: FourPositions) -> Tensor | None:
-        """Where the push has jumped."""
-        return (advanced.push - state.push).abs() > self.jump
 
 
 @dataclass(frozen=True)
@@ -113,16 +114,12 @@ class _Drop(Bdf2):
         last = Positions(q=state.q, q_previous=state.history[0], time=state.time, hazards=state.hazards)
         return ImplicitEuler().context(articulation, last, dt, gravity, control)
 
-    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> FourPositions:
+    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> tuple[FourPositions, None]:
         """With a past of constant velocity."""
         moved = difference(objective.articulation, state.q, q)
         one = torch.ones_like(moved[..., 0])
         past = _past(objective.articulation, q, moved, torch.zeros_like(moved), one)
-        return FourPositions(**after(objective, q), history=past, push=objective.push(q))
-
-    def refused(self, objective: BalanceObjective, state: FourPositions, advanced: FourPositions) -> Tensor | None:
-        """None."""
-        return None
+        return FourPositions(**after(objective, q), history=past, push=objective.push(q)), None
 
 
 def _past(articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:

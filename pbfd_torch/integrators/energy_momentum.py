@@ -15,7 +15,7 @@ and 1 (`Fitted`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,32 +23,44 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.assembly import Balance
-from pbfd_torch.dynamics import armature_diagonal, generalised_momentum, mass_matrix
+from pbfd_torch.dynamics import armature_diagonal, generalised_momentum, kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, State, after, fresh
-from pbfd_torch.kinematics import Motion, Placement, difference, place, retract
+from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
+from pbfd_torch.kinematics import Chord, Motion, Placement, difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import Load, StepContext, Term
 from pbfd_torch.worlds import replaced
 
+HARDEST = 3.0
+FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
+FARTHEST = 2.0  # [rad] that a joint may turn by in a step
+EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Velocities(State):
     """Attributes:
-    v: the velocity that the next step starts with `[*batch, nv]`, short of that at t_n by half of `push`.
-    push: velocity that early forces have given in the step that ended here, Δt M⁻¹ Σ (2θ − 1) f, `[*batch, nv]`.
+    v: the velocity that the next step starts with `[*batch, nv]`.
+    push: velocity that early forces have given in the step that ended here, p = Δt M⁻¹ Σ (2θ − 1) f, `[*batch, nv]`.
+    steady: the part of it that they have also given in the step before, `[*batch, nv]`: v is short of the velocity at t_n by half
+        of it. An impact's push is no part of this: it has been given once for all.
+    average: velocity over that step, `[*batch, nv]`: with it the next step's solution is guessed.
     """
 
     v: Tensor
     push: Tensor
+    steady: Tensor
+    average: Tensor
 
 
 @dataclass(frozen=True)
 class EnergyMomentum:
-    """κ = 1/Δt², T̂ = T_n + Δt V_n + ½Δt² [0 | g], share ½."""
+    """κ = 1/Δt², T̂ = T_n + Δt V_n + ½Δt² [0 | g], share ½. The step is refused where a link has turned so far that the chord knows
+    little of its rotation (virtual work vanishes there, and so does the residual, whatever the forces), and where contacts have
+    done more work than they can."""
 
     @property
     def easier(self) -> Sequence[Integrator[Velocities]]:
@@ -59,13 +71,22 @@ class EnergyMomentum:
         """Springs, damping and actuators between the trapezoidal rule and implicit Euler."""
         return fitted(articulation, terms, dt)
 
-    def start(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Callable[[], Tensor], dt: Tensor) -> Velocities:
-        """The velocity itself: contacts that hold from the start on find their own half step."""
-        return Velocities(**fresh(q), v=v, push=torch.zeros_like(v))
+    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> Velocities:
+        """With the impulse that contacts, limits and friction give in a trial step; with none where it has more kinetic energy than
+        a fall of `HARDEST` steps: then something hits something else, and has given nothing before."""
+        trial, dt = stepper.trial(q, v, control), stepper.step_size
+        nothing = torch.zeros_like(v)
+        objective = stepper.objective(Velocities(**fresh(q), v=v, push=nothing, steady=nothing, average=v), control)
+        now = place(stepper.articulation, trial.end)
+        impulse = dt[..., None] * _Forces(objective, now).early
+        _, push = _velocities(objective, now, nothing, impulse)
+        steady = trial.solved & ((impulse * push).sum(-1) <= 2 * HARDEST**2 * _fall(objective))
+        push = torch.where(steady[..., None], push, nothing)
+        return Velocities(**fresh(q), v=v - 0.5 * push, push=push, steady=push, average=v)
 
     def velocity(self, articulation: Articulation, state: Velocities, dt: Tensor) -> Tensor:
         """At t_n."""
-        return state.v + 0.5 * state.push
+        return state.v + 0.5 * state.steady
 
     def pose_rates(self, articulation: Articulation, state: Velocities, dt: Tensor) -> Tensor:
         """At t_n."""
@@ -87,29 +108,47 @@ class EnergyMomentum:
             target_q=retract(articulation, state.q, dt[..., None] * state.v),
             control=control,
             time=state.time,
+            gravity=gravity,
             share=torch.full_like(state.q[..., 0], 0.5),
+            guess=retract(articulation, state.q, dt[..., None] * state.average),
         )
 
-    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> Velocities:
+    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> tuple[Velocities, Tensor | None]:
         """See `Integrator`."""
-        articulation, step = objective.articulation, objective.step
-        now = place(articulation, q)
-        twice = 2 / step.dt
-        rates = twice[..., None, None, None] * (now.poses - step.previous.poses)[..., :3, :]
-        turning = twice[..., None] * difference(articulation, state.q, q)
-        momentum = _momentum(objective, now, rates - Motion(step.previous, state.v).rates, turning - state.v)
-        early = step.dt[..., None] * _early_forces(objective, now)
-        v, push = _velocities(objective, now, momentum - early, early)
-        return Velocities(**after(objective, q), v=v, push=push)
+        step, now = objective.step, place(objective.articulation, q)
+        forces, dt = _Forces(objective, now), step.dt
+        rates, average = _averages(objective, state, now)
+        before = Motion(step.previous, state.v).rates
+        impulse = dt[..., None] * forces.early
+        momentum = _momentum(objective, now, 2 * rates - before, 2 * average - state.v) - impulse
+        end = _ended(objective, state, now, momentum, impulse, average)
+        flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
+        turned = objective.turn(dt[..., None] * average)
+        gained, energy = self._gain(objective, state, end, now, forces)
+        return end, (flat < FLATTEST) | (turned > FARTHEST) | (gained > EXCESS * energy)
+
+    def _gain(
+        self, objective: BalanceObjective, state: Velocities, end: Velocities, now: Placement, forces: _Forces
+    ) -> tuple[Tensor, Tensor]:
+        """Energy [J] `[*batch]` gained in a step beyond the forces' work on what has moved, and the kinetic energies together."""
+        a, step = objective.articulation, objective.step
+        first, last = (
+            kinetic_energy(a, Motion(at, v).rates) + rotor_energy(a, v, objective.terms)
+            for at, v in ((step.previous, self.velocity(a, state, step.dt)), (now, self.velocity(a, end, step.dt)))
+        )
+        fall = potential_energy(step.previous, step.gravity) - potential_energy(now, step.gravity)
+        work = step.dt * ((forces.rough + forces.smooth) * end.average).sum(-1)
+        return last - first - fall - work, first + last + _fall(objective)
+
+    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
+        """Where nothing pushes: what an easier step would take of the energy is worth two shorter ones."""
+        return objective.push(objective.step.previous.q) + objective.push(q) == 0
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""
-        push = (new / dt)[..., None] * state.push
-        return replaced(state, v=state.v + 0.5 * (state.push - push), push=push)
-
-    def refused(self, objective: BalanceObjective, state: Velocities, advanced: Velocities) -> Tensor | None:
-        """None: every solved step stands."""
-        return None
+        share = (new / dt)[..., None]
+        steady = share * state.steady
+        return replaced(state, v=state.v + 0.5 * (state.steady - steady), push=share * state.push, steady=steady)
 
 
 @dataclass(frozen=True)
@@ -122,27 +161,48 @@ class _PaperStep(EnergyMomentum):
         """None."""
         return ()
 
-    def adapted(self, articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
-        """The terms themselves, all implicit."""
-        return terms
-
     def context(
         self, articulation: Articulation, state: Velocities, dt: Tensor, gravity: Tensor, control: Tensor | None
     ) -> StepContext:
         """See `Integrator`."""
         return replaced(super().context(articulation, state, dt, gravity, control), share=None)
 
-    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> Velocities:
-        """With the average velocity of the step, and what gravity adds to it in half a step."""
-        articulation, step = objective.articulation, objective.step
-        now = place(articulation, q)
-        # T̂ is ahead of T_n + Δt V by the way of gravity, ½Δt² g
-        moved = (now.poses - step.previous.poses + step.target_poses - step.previous.poses)[..., :3, :]
-        rates = moved / step.dt[..., None, None, None] - Motion(step.previous, state.v).rates
-        turning = difference(articulation, state.q, q) / step.dt[..., None]
-        early = step.dt[..., None] * _early_forces(objective, now)
-        v, push = _velocities(objective, now, _momentum(objective, now, rates, turning), early)
-        return Velocities(**after(objective, q), v=v, push=push)
+    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> tuple[Velocities, None]:
+        """With the average velocity of the step, and what the forces that are not early give after it."""
+        step, now = objective.step, place(objective.articulation, q)
+        forces, h = _Forces(objective, now), step.dt[..., None]
+        rates, average = _averages(objective, state, now)
+        rates = torch.cat((rates[..., :3], rates[..., 3:] + 0.5 * (h * step.gravity)[..., None, :, None]), -1)
+        momentum = _momentum(objective, now, rates, average) + h * forces.late
+        return _ended(objective, state, now, momentum, h * forces.early, average), None
+
+
+class _Forces:
+    """Generalised forces `[*batch, nv]` at the end of a step, but for inertia: `rough` ones, which come early (θ = 1), and `smooth`
+    ones, of which 2θ − 1 comes early and 1 − θ late."""
+
+    def __init__(self, objective: BalanceObjective, now: Placement) -> None:
+        rough: list[Load] = []
+        self.rough = torch.zeros_like(now.axes[..., 0])
+        self.smooth, self.early, self.late = self.rough, self.rough, self.rough
+        for term, prepared in zip(objective.terms, objective.prepared, strict=True):
+            if isinstance(term, Fitted):
+                force = -term.load(prepared, now).residual / term.share
+                self.smooth = self.smooth + force
+                self.early = self.early + (2 * term.share - 1) * force
+                self.late = self.late + (1 - term.share) * force
+            elif not isinstance(term, Inertia | Armature):
+                rough.append(term.load(prepared, now))
+        if rough:
+            self.rough = -Balance(now, rough).residual
+            self.early = self.early + self.rough
+
+
+def _averages(objective: BalanceObjective, state: Velocities, now: Placement) -> tuple[Tensor, Tensor]:
+    """Rates of the link poses `[*batch, nlink, 3, 4]` and velocity `[*batch, nv]` over a step."""
+    step = objective.step
+    rates = (now.poses - step.previous.poses)[..., :3, :] / step.dt[..., None, None, None]
+    return rates, difference(objective.articulation, state.q, now.q) / step.dt[..., None]
 
 
 def _momentum(objective: BalanceObjective, now: Placement, rates: Tensor, turning: Tensor) -> Tensor:
@@ -151,15 +211,21 @@ def _momentum(objective: BalanceObjective, now: Placement, rates: Tensor, turnin
     return generalised_momentum(now, rates) + rotors * turning
 
 
-def _early_forces(objective: BalanceObjective, now: Placement) -> Tensor:
-    """Σ (2θ − 1) f over everything but inertia `[*batch, nv]`."""
-    loads: list[Load] = []
-    for term, prepared in zip(objective.terms, objective.prepared, strict=True):
-        if isinstance(term, Fitted):
-            loads.append(term.early(prepared, now))
-        elif not isinstance(term, Inertia | Armature):
-            loads.append(term.load(prepared, now))
-    return -Balance(now, loads).residual
+def _ended(
+    objective: BalanceObjective, state: Velocities, now: Placement, momentum: Tensor, impulse: Tensor, average: Tensor
+) -> Velocities:
+    """The state at a placement with that momentum, after early forces have given that impulse."""
+    v, push = _velocities(objective, now, momentum, impulse)
+    # ⟨p, M p'⟩ / ⟨p, M p⟩ is how much of this push p the last one p' was
+    kept, whole = (impulse * state.push).sum(-1), (impulse * push).sum(-1)
+    share = (kept / torch.where(whole > 0, whole, torch.ones_like(whole))).clamp(0, 1)
+    return Velocities(**after(objective, now.q), v=v, push=push, steady=share[..., None] * push, average=average)
+
+
+def _fall(objective: BalanceObjective) -> Tensor:
+    """Kinetic energy [J] `[*batch]` of a fall over one step, of 1 m/s² at least."""
+    strength = torch.linalg.vector_norm(objective.step.gravity, dim=-1).clamp_min(1.0)
+    return 0.5 * objective.articulation.mass.sum(-1) * (objective.step.dt * strength) ** 2
 
 
 def _velocities(objective: BalanceObjective, now: Placement, momentum: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:

@@ -25,20 +25,27 @@ class Fittable(Protocol):
         ...
 
     def taken_at(self, share: Tensor) -> Self:
-        """The same term at the coordinates q_n + θ (q − q_n), θ `[*, nv]`."""
+        """θ of the term, θ `[*, nv]`, at the coordinates q_n + θ (q − q_n)."""
         ...
 
     def prepare(self, step: StepContext) -> Any: ...
 
     def load(self, prepared: Any, placement: Placement) -> JointLoad: ...
 
+    def energy(self, prepared: Any, placement: Placement) -> Tensor: ...
+
     def take(self, worlds: Worlds) -> Self: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A term of which the share θ `[*, nv]` moves the bodies: by θ Δt² a over the step, a its acceleration, ½ being the trapezoidal
-    rule and 1 implicit Euler."""
+    """A term that moves the bodies by θ Δt² a over a step, a its acceleration: as the trapezoidal rule has it with θ = ½, as
+    implicit Euler with θ = 1.
+
+    Attributes:
+        term: already `taken_at` θ.
+        share: θ `[*, nv]`.
+    """
 
     term: Fittable
     share: Tensor
@@ -47,14 +54,11 @@ class Fitted:
         return self.term.prepare(step)
 
     def load(self, prepared: Any, placement: Placement) -> JointLoad:
-        load = self.term.load(prepared, placement)
-        return JointLoad(self.share * load.residual, lambda: self.share[..., None] * load.stiffness)
+        return self.term.load(prepared, placement)
 
-    def early(self, prepared: Any, placement: Placement) -> JointLoad:
-        """2θ − 1 of the term: what moves the bodies as if its impulse came half a step before."""
-        load = self.term.load(prepared, placement)
-        ahead = 2 * self.share - 1
-        return JointLoad(ahead * load.residual, lambda: ahead[..., None] * load.stiffness)
+    def energy(self, prepared: Any, placement: Placement) -> Tensor:
+        """See `Potential`."""
+        return self.term.energy(prepared, placement)
 
     def take(self, worlds: Worlds) -> Self:
         """The same with the parameters of some worlds."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.integrators.integrator import Integrator, State, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
 from pbfd_torch.kinematics import difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.load import StepContext, Term
@@ -36,10 +36,15 @@ class ImplicitEuler:
         """The terms themselves, all implicit."""
         return terms
 
-    def start(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Callable[[], Tensor], dt: Tensor) -> Positions:
-        """θ_{−1} = θ_0 − Δt v + ½ Δt² a. Leaving out a would shift the whole motion by half a step's impulse (METHOD §5)."""
+    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> Positions:
+        """θ_{−1} = θ_0 − Δt v + ½ Δt² a. Leaving out a would shift the whole motion by half a step's impulse (METHOD §5). Stiff
+        contacts are felt as they will be, because a comes from a trial step."""
+        return self.at_rate(stepper.articulation, q, v, stepper.trial(q, v, control).acceleration, stepper.step_size)
+
+    def at_rate(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, dt: Tensor) -> Positions:
+        """State at t = 0 of a motion at constant acceleration `[*batch, nv]`."""
         h = dt[..., None]
-        return Positions(**fresh(q), q_previous=retract(articulation, q, 0.5 * h * h * acceleration() - h * v))
+        return Positions(**fresh(q), q_previous=retract(articulation, q, 0.5 * h * h * acceleration - h * v))
 
     def velocity(self, articulation: Articulation, state: Positions, dt: Tensor) -> Tensor:
         """Average velocity over the step that ends at t_n (Eq. 3), `[*batch, nv]`."""
@@ -63,21 +68,22 @@ class ImplicitEuler:
             target_q=retract(articulation, state.q, difference(articulation, state.q_previous, state.q)),
             control=control,
             time=state.time,
+            gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> Positions:
+    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, None]:
         """See `Integrator`."""
-        return Positions(**after(objective, q), q_previous=state.q)
+        return Positions(**after(objective, q), q_previous=state.q), None
+
+    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
+        """None: an easier step is good enough."""
+        return torch.zeros_like(q[..., 0], dtype=torch.bool)
 
     def resized(self, articulation: Articulation, state: Positions, dt: Tensor, new: Tensor) -> Positions:
         """See `Integrator`."""
         share = new / dt
         back = share[..., None] * difference(articulation, state.q, state.q_previous)
         return replaced(state, q_previous=retract(articulation, state.q, back))
-
-    def refused(self, objective: BalanceObjective, state: Positions, advanced: Positions) -> Tensor | None:
-        """None: every solved step stands."""
-        return None
 
 
 def fallen(poses: Tensor, fall: Tensor) -> Tensor:

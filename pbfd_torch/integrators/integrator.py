@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -26,12 +26,14 @@ class State:
         time: t_n `[*batch]` [s]; obstacles move by it.
         hazards: `Hazard` bits of the step that ended here, `[*batch]` int.
         memory: what the terms that remember something have from it, each `[*batch, ...]`; empty: nothing yet.
+        pace: the step [s] `[*batch]` that each world goes on with where they choose their own; None: they do not.
     """
 
     q: Tensor
     time: Tensor
     hazards: Tensor
     memory: tuple[Tensor, ...] = ()
+    pace: Tensor | None = None
 
     def take(self, worlds: Worlds) -> Self:
         """The state of some worlds."""
@@ -40,6 +42,41 @@ class State:
 
 
 S = TypeVar("S", bound=State, default=Any)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """How a step has ended that was made to feel the forces, stiff ones above all, as they are going to be.
+
+    Attributes:
+        end: where, `[*batch, nq]`.
+        acceleration: M⁻¹ (f − h) at the start, with the forces f of the end, `[*batch, nv]`; zero where it is unsolved.
+        solved: `[*batch]`.
+    """
+
+    end: Tensor
+    acceleration: Tensor
+    solved: Tensor
+
+
+class Stepper(Protocol):
+    """What an integrator may ask of the simulator that it starts in."""
+
+    @property
+    def articulation(self) -> Articulation: ...
+
+    @property
+    def step_size(self) -> Tensor:
+        """Δt [s], a scalar tensor."""
+        ...
+
+    def trial(self, q: Tensor, v: Tensor, control: Tensor | None) -> Trial:
+        """A step of implicit Euler that sets out from q with v."""
+        ...
+
+    def objective(self, state: Any, control: Tensor | None) -> BalanceObjective:
+        """The step from a state."""
+        ...
 
 
 class Integrator(Protocol[S]):
@@ -55,8 +92,8 @@ class Integrator(Protocol[S]):
         """The terms as they act in a step, in the same order."""
         ...
 
-    def start(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Callable[[], Tensor], dt: Tensor) -> S:
-        """State at t = 0 of the motion with velocity v `[*batch, nv]` and the acceleration `[*batch, nv]` of a trial step."""
+    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> S:
+        """State at t = 0 at q `[*batch, nq]` with velocity v `[*batch, nv]`, of second order in the step."""
         ...
 
     def velocity(self, articulation: Articulation, state: S, dt: Tensor) -> Tensor:
@@ -71,16 +108,18 @@ class Integrator(Protocol[S]):
         """What is fixed during the step from `state`."""
         ...
 
-    def advance(self, objective: BalanceObjective, state: S, q: Tensor) -> S:
-        """The state after the step of an objective that ended at q."""
+    def advance(self, objective: BalanceObjective, state: S, q: Tensor) -> tuple[S, Tensor | None]:
+        """The state after the step of an objective that ended at q, and the worlds `[*batch]` that may not go on from there,
+        although it was solved, but must take an easier step; None: no world."""
+        ...
+
+    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
+        """Worlds `[*batch]` that had better take two shorter steps than an easier one, if that which was left at q is unsolved or
+        refused."""
         ...
 
     def resized(self, articulation: Articulation, state: S, dt: Tensor, new: Tensor) -> S:
         """The state as seen by steps of another length: at the same place with the same velocity."""
-        ...
-
-    def refused(self, objective: BalanceObjective, state: S, advanced: S) -> Tensor | None:
-        """Worlds `[*batch]` whose step an easier one must replace although it was solved; None: no world."""
         ...
 
 

@@ -75,7 +75,7 @@ class Actuators:
     damping: Tensor
     control_range: Tensor  # [nu, 2]
     force_range: Tensor  # [nu, 2]
-    share: Tensor | None = None  # where in the step the coordinate is taken that the stiffness answers; None: at its end
+    share: Tensor | None = None  # see `taken_at`
 
     @staticmethod
     def from_list(articulation: Articulation, actuators: Sequence[Actuator]) -> Actuators:
@@ -146,7 +146,7 @@ class Actuators:
         return (of_each[..., None, :] @ _spread(self.dof, articulation, of_each.dtype)).squeeze(-2)
 
     def taken_at(self, share: Tensor) -> Self:
-        """The same actuators, whose stiffness answers the coordinates at the share θ `[*, nv]` of the step."""
+        """θ of the actuators, θ `[*, nv]`, whose stiffness answers the coordinates q_n + θ (q − q_n)."""
         return replaced(self, share=share[..., self.dof])
 
     @property
@@ -174,6 +174,8 @@ class Actuators:
         force = _clamped(force, self.force_range)
         slope = torch.where(inside, fall, torch.zeros_like(force)) * self.gear * self.gear
         spread = prepared.spread.expand(*placement.q.shape[:-1], *prepared.spread.shape)
+        if self.share is not None:
+            force, slope = self.share * force, self.share * slope
         residual = (-(self.gear * force)[..., None, :] @ spread).squeeze(-2)
         return JointLoad(residual, lambda: torch.diag_embed((slope[..., None, :] @ spread).squeeze(-2)))
 
@@ -188,7 +190,8 @@ class Actuators:
         limited_first, limited_last = _clamped(first, self.force_range), _clamped(last, self.force_range)
         safe = torch.where(slope > 0, slope, torch.ones_like(slope))  # where g = 0, f = f₀
         beyond = (limited_last - limited_first) * (last - limited_last + first - limited_first) / safe
-        return 0.5 * (beyond - (limited_last + limited_first) * moved).sum(-1)
+        work = 0.5 * (beyond - (limited_last + limited_first) * moved)
+        return (work if self.share is None else self.share * work).sum(-1)
 
 
 def _clamped(value: Tensor, bounds: Tensor) -> Tensor:

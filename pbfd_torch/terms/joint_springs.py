@@ -66,8 +66,7 @@ class _Pull:
 
 @dataclass(frozen=True, eq=False)
 class JointSprings(_Pull):
-    """Torque −k (q − rest). `stiffness` `[*, nv]` [N m/rad or N/m] ≥ 0, `rest` `[*, nq]`. `share`: where in the step q is taken,
-    θ `[*, nv]` of its way; None: at its end."""
+    """Torque −k (q − rest). `stiffness` `[*, nv]` [N m/rad or N/m] ≥ 0, `rest` `[*, nq]`. `share`: see `taken_at`."""
 
     stiffness: Tensor
     rest: Tensor
@@ -81,20 +80,29 @@ class JointSprings(_Pull):
 
     def load(self, prepared: PreparedPull, placement: Placement) -> JointLoad:
         """See `Term`."""
+        load = super().load(prepared, self._taken(prepared, placement))
         share = self.share
-        if share is None or prepared.start is None:
-            return super().load(prepared, placement)
-        articulation = placement.articulation
-        q = retract(articulation, prepared.start, share * difference(articulation, prepared.start, placement.q))
-        load = elastic_load(articulation, prepared.coefficient, prepared.rest, q)
-        return JointLoad(load.residual, lambda: load.stiffness * share[..., None, :])
+        if share is None:
+            return load
+        return JointLoad(share * load.residual, lambda: share[..., None] * load.stiffness * share[..., None, :])
+
+    def energy(self, prepared: PreparedPull, placement: Placement) -> Tensor:
+        """The stored energy [J] `[*batch]`, where the coordinates are taken."""
+        return super().energy(prepared, self._taken(prepared, placement))
+
+    def _taken(self, prepared: PreparedPull, placement: Placement) -> Placement:
+        """The coordinates at the share of the step; the poses are left where they are."""
+        if self.share is None or prepared.start is None:
+            return placement
+        a, start = placement.articulation, prepared.start
+        return replaced(placement, q=retract(a, start, self.share * difference(a, start, placement.q)))
 
     def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
         """∂r/∂q `[*, nv]`."""
         return self.stiffness
 
     def taken_at(self, share: Tensor) -> Self:
-        """The same springs at the share θ of the step."""
+        """θ of the springs, at q_n + θ (q − q_n), θ `[*, nv]`; 1 for ball and free joints."""
         return replaced(self, share=share)
 
     def take(self, worlds: Worlds) -> Self:
@@ -104,7 +112,7 @@ class JointSprings(_Pull):
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
-        return self.energy(PreparedPull(self.stiffness, self.rest), placement)
+        return super().energy(PreparedPull(self.stiffness, self.rest), placement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +132,8 @@ class JointDamping(_Pull):
         return self.damping / dt[..., None]
 
     def taken_at(self, share: Tensor) -> Self:
-        """Itself: its impulse is the same wherever the coordinates are taken, −c times what they move by."""
-        return self
+        """θ of the damping, θ `[*, nv]`; it answers what the coordinates move by, wherever in the step."""
+        return replaced(self, damping=share * self.damping)
 
     def take(self, worlds: Worlds) -> Self:
         """The same damping with the coefficients of some worlds."""

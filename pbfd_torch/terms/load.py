@@ -28,6 +28,8 @@ class StepContext:
         time: [s] at the start, like dt.
         share: w `[*batch]`, where on the chord from the start of the step to its end inertia does its virtual work; None: at
             its end, as in the paper.
+        gravity: `[*batch, 3]` [m/s²], or one for all; the target poses hold it.
+        guess: `[*batch, nq]` where the step may end; None: at target_q.
     """
 
     dt: Tensor
@@ -37,7 +39,9 @@ class StepContext:
     target_q: Tensor
     control: Tensor | None
     time: Tensor
+    gravity: Tensor
     share: Tensor | None = None
+    guess: Tensor | None = None
 
     def take(self, worlds: Worlds) -> StepContext:
         """The step of some worlds."""
@@ -50,7 +54,9 @@ class StepContext:
             target_q=worlds.pick(self.target_q, 1),
             control=None if self.control is None else worlds.pick(self.control, 1),
             time=worlds.pick(self.time, 0),
+            gravity=worlds.pick(self.gravity, 1),
             share=None if self.share is None else worlds.pick(self.share, 0),
+            guess=None if self.guess is None else worlds.pick(self.guess, 1),
         )
 
 

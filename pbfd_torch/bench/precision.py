@@ -1,0 +1,275 @@
+"""Work–precision: how far off a motion is, and what it costs, for our integrators and MuJoCo's in one run, one thread, float64.
+
+Errors come from a recorded motion from the scene's own start. Costs are those of bare steps: of MuJoCo over the same motion; ours
+over short pieces of it that start at times spread evenly over it, since a batch of 256 worlds would take too long for all of it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.bench import mujoco_runs
+from pbfd_torch.bench.precision_scenes import CASES, Case
+from pbfd_torch.bench.precision_tracks import Track
+from pbfd_torch.bench.timing import Progress
+from pbfd_torch.integrators.named import INTEGRATORS
+from pbfd_torch.rollout import Rollout
+from pbfd_torch.simulator import Simulator
+from pbfd_torch.solvers.objective import FALLBACKS
+
+OURS, PEER = "pbfd_torch", "MuJoCo"
+SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
+NOTES = (
+    "error: root mean square of the distance from the reference over what is observed; Δt: held to it, no step is adapted",
+    (
+        "time of ours: bare steps; each world of a batch starts from another time of the motion, spread evenly over it, so that "
+        "the worlds are in different phases and wait for the slowest; a single world is timed from several such times (box: μ = .1)"
+    ),
+    "time of MuJoCo: the whole motion in C, the shortest of up to 3 runs; it has no batch: one world's time stands for any number",
+    (
+        "MuJoCo's contacts: elliptic cones, impratio 100, time constant 2Δt, so as stiff as it takes them; the robots' as their "
+        "files have them"
+    ),
+    (
+        "where the reference is each simulator's own, contact models differ and so do the motions: ours is the integrator that "
+        "changes least as its step is halved, MuJoCo's is RK4; ±: by how much it still changed, and no error below that counts"
+    ),
+    "diverged: MuJoCo found a bad state, or ours is not finite; unsolved: steps that ours left without a root",
+    "an error counts as reached where all steps are solved and the energy rises by no more than .1 of the largest kinetic energy",
+)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured.
+
+    Attributes:
+        steps, peer_steps: time steps [s], ours and MuJoCo's.
+        own_step, own_peer_step: [s] of the motions that serve as references where there is no exact one.
+        worlds: of the batch, beside a single world.
+        seconds: spent on the time of a single world and of a batch.
+        pieces: of the motion, that a single world is timed over; a batch is timed over as much, all at once.
+        repeats: of MuJoCo's runs, at most.
+        scenes: that are run where none are asked for.
+    """
+
+    steps: tuple[float, ...] = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+    peer_steps: tuple[float, ...] = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
+    own_step: float = 0.001
+    own_peer_step: float = 0.0001
+    worlds: int = 256
+    seconds: tuple[float, float] = (0.4, 0.6)
+    pieces: int = 8
+    repeats: int = 3
+    scenes: tuple[str, ...] = tuple(CASES)
+
+    def steps_of(self, case: Case) -> tuple[float, ...]:
+        """Ours for this scene [s]."""
+        return tuple(dt for dt in self.steps if dt >= case.smallest_step)
+
+    def units(self, case: Case, integrators: Sequence[str], peers: Sequence[str]) -> int:
+        """How often `measure_scene` tells its progress."""
+        ours = len(integrators) * (2 * len(self.steps_of(case)) + (2 if case.exact is None else 0))
+        return ours + len(peers) * len(self.peer_steps)
+
+
+FULL = Effort()
+QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 0.005, 0.0005, 8, (0.1, 0.1), 1, 1, ("chain-fixed", "box-slide"))
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A recorded motion of one of our integrators."""
+
+    integrator: str
+    dt: float
+    track: Track
+    rollout: Rollout
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What should be observed; `uncertainty`: by how much it changed as its step was halved, 0 where it is exact."""
+
+    value: Tensor
+    uncertainty: float = 0.0
+    source: str = ""
+
+
+def step_count(duration: float, dt: float) -> int:
+    """Steps in a duration that they divide."""
+    return round(duration / dt)
+
+
+def our_motion(case: Case, integrator: str, dt: float, duration: float) -> Motion:
+    """From the scene's start, recorded."""
+    setup = case.setup(case.tracked_worlds)
+    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator]())
+    steps = step_count(duration, dt)
+    controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
+    start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
+    rollout = simulator.rollout(start, controls, steps if controls is None else None)
+    return Motion(integrator, dt, Track.of_rollout(setup, rollout), rollout)
+
+
+def peer_motion(case: Case, integrator: str, dt: float, duration: float, repeats: int = 1) -> tuple[Track, float, bool]:
+    """MuJoCo's from the same start, its wall time per world [s], and whether it diverged."""
+    setup = case.setup(case.tracked_worlds)
+    steps = step_count(duration, dt)
+    controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64))
+    runs = [
+        mujoco_runs.run(mujoco_runs.loaded(case.scene, dt, integrator, k), setup.q[k], setup.v[k], steps, controls, repeats)
+        for k in range(setup.worlds)
+    ]
+    q, v = torch.stack([run.q for run in runs], 1), torch.stack([run.v for run in runs], 1)
+    track = Track.of_states(setup.scene, dt * torch.arange(steps + 1, dtype=torch.float64), q, v)
+    return track, sum(run.seconds for run in runs) / len(runs), any(run.diverged for run in runs)
+
+
+def starts(track: Track, worlds: int, first: int, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """`[worlds, nq]`, `[worlds, nv]` and times `[worlds]` [s] for one of `count` groups, `first` = 0 … count − 1. The starts of all
+    groups together are spread evenly over the motion, as far as it is finite."""
+    whole = torch.isfinite(track.q).all(-1).all(-1) & torch.isfinite(track.v).all(-1).all(-1)
+    usable = max(1, int(whole.long().cumprod(0).sum()) - 1)
+    world = torch.arange(worlds)
+    row = (first + count * world) * usable // (count * worlds)
+    copy = world % track.q.shape[1]
+    return track.q[row, copy], track.v[row, copy], track.time[row]
+
+
+def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: int) -> float:
+    """Wall time per simulated second and world [ms]."""
+    setup = case.setup(worlds)
+    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator]())
+    groups = pieces if worlds == 1 else 1
+    span = max(2, motion.rollout.steps // pieces)
+    each = []
+    for group in range(groups):
+        q, v, begin = starts(motion.track, worlds, group, groups)
+        controls = [case.controls(motion.dt, begin + motion.dt * k) for k in range(span + 1)]
+        fresh, began = simulator.initial_state(q, v, controls[0]), time.perf_counter()
+        # the first step does not count: a velocity that is an average over the last one makes it harder than others
+        start, _ = simulator.step(fresh, controls[0])
+        if (first := time.perf_counter() - began) > SLOW * seconds / groups:
+            each.append(first)
+            continue
+        state, count, began = start, 0, time.perf_counter()
+        while count < 2 or time.perf_counter() - began < seconds / groups:
+            state = start if count % span == 0 else state
+            state, _ = simulator.step(state, controls[1 + count % span])
+            count += 1
+        each.append((time.perf_counter() - began) / count)
+    return 1e3 * sum(each) / groups / motion.dt / worlds
+
+
+def our_reference(case: Case, fine: Sequence[Motion], coarse: Sequence[Motion]) -> Reference:
+    """The finest motion of the integrator that changed least from twice its step; exact where that is known."""
+    if case.exact is not None:
+        return Reference(case.exact())
+    found = []
+    for best, other in zip(fine, coarse, strict=True):
+        value = case.observe(best.track)
+        change = case.error(other.track, value)
+        found.append(Reference(value, change if math.isfinite(change) else math.inf, f"{best.integrator} at {best.dt:g} s"))
+    return min(found, key=lambda reference: reference.uncertainty)
+
+
+def peer_reference(case: Case, dt: float) -> Reference:
+    """RK4's at dt, and how far it is from that at twice the step; exact where that is known."""
+    if case.exact is not None:
+        return Reference(case.exact())
+    until = min(case.duration, case.observed_s)
+    value = case.observe(peer_motion(case, "RK4", dt, until)[0])
+    return Reference(value, case.error(peer_motion(case, "RK4", 2 * dt, until)[0], value), f"RK4 at {dt:g} s")
+
+
+def our_row(case: Case, motion: Motion, reference: Reference, other: Reference | None, effort: Effort) -> dict[str, Any]:
+    """One time step of one integrator as plain data; other: MuJoCo's reference, where it has its own."""
+    rollout = motion.rollout
+    away = {} if other is None or case.exact is not None else {"error_to_mujoco": case.error(motion.track, other.value)}
+    batches = dict(zip((1, effort.worlds), effort.seconds, strict=True))
+    return {
+        "simulator": OURS,
+        "integrator": motion.integrator,
+        "dt": motion.dt,
+        "error": case.error(motion.track, reference.value),
+        "diverged": not bool(torch.isfinite(motion.track.q).all()),
+        "world_steps": rollout.status.numel(),
+        "unsolved_steps": int((~rollout.solved).sum()),
+        "fallbacks": dict(zip(FALLBACKS, rollout.fallbacks.sum((0, 1)).tolist(), strict=True)),
+        "evaluations": float(rollout.evaluations.double().mean()),
+        "ms_per_s": {str(worlds): our_cost(case, motion, worlds, seconds, effort.pieces) for worlds, seconds in batches.items()},
+        **_told(case, motion.track),
+        **away,
+    }
+
+
+def peer_row(case: Case, integrator: str, dt: float, reference: Reference, repeats: int) -> dict[str, Any]:
+    """The same of MuJoCo."""
+    track, seconds, diverged = peer_motion(case, integrator, dt, case.duration, repeats)
+    return {
+        "simulator": PEER,
+        "integrator": integrator,
+        "dt": dt,
+        "error": case.error(track, reference.value),
+        "diverged": diverged,
+        "world_steps": (len(track.time) - 1) * case.tracked_worlds,
+        "unsolved_steps": 0,
+        "ms_per_s": {"1": math.nan if diverged else 1e3 * seconds / case.duration},
+        **_told(case, track),
+    }
+
+
+def _told(case: Case, track: Track) -> dict[str, float]:
+    numbers = track.numbers()
+    return {name: numbers[name] for name in case.numbers}
+
+
+def measure_scene(
+    case: Case, integrators: Sequence[str], peers: Sequence[str], effort: Effort, progress: Progress
+) -> dict[str, Any]:
+    """All rows of one scene as plain data. peers: MuJoCo's integrators; none: without MuJoCo."""
+
+    def recorded(name: str, dt: float, duration: float) -> Motion:
+        progress(1)
+        return our_motion(case, name, dt, duration)
+
+    until = min(case.duration, case.observed_s)
+    own = (effort.own_step, 2 * effort.own_step) if case.exact is None else ()
+    fine, coarse = ([recorded(name, dt, until) for name in integrators] for dt in own) if own else ([], [])
+    motions = [recorded(name, dt, case.duration) for name in integrators for dt in effort.steps_of(case)]
+    reference = our_reference(case, fine, coarse)
+    other = peer_reference(case, effort.own_peer_step) if peers else None
+    rows = []
+    for motion in motions:
+        rows.append(our_row(case, motion, reference, other, effort))
+        progress(1)
+    if other is not None:
+        for name in peers:
+            for dt in effort.peer_steps:
+                rows.append(peer_row(case, name, dt, other, effort.repeats))
+                progress(1)
+    return {
+        "title": case.title,
+        "unit": case.unit,
+        "duration_s": case.duration,
+        "levels": list(case.levels),
+        "reference": case.reference,
+        "own_references": _own({OURS: reference, PEER: other}) if case.exact is None else {},
+        "rows": rows,
+    }
+
+
+def _own(references: Mapping[str, Reference | None]) -> dict[str, Any]:
+    return {
+        simulator: {"source": found.source, "uncertainty": found.uncertainty}
+        for simulator, found in references.items()
+        if found is not None
+    }

@@ -1,0 +1,113 @@
+"""`pbfd bench slope`: Fig. 6 of the paper, measured."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from tqdm import tqdm
+
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.options import use_threads
+from pbfd_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from pbfd_torch.bench.figure_6 import Effort
+
+FILES = ("slope.json", "slope.md", "figure-6.png")
+DURATIONS = (0.1, 60.0)  # [s] that can be asked for
+
+
+def slope(
+    out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-slope"),
+    duration: Annotated[
+        float | None, typer.Option(help="Simulated time of a trajectory in seconds; default: 10, or 1 with --quick.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Three time steps, a small batch, a short trajectory.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
+) -> None:
+    """Slides a chain off a slope with ours, conventional Newton–Euler and MuJoCo: time against Δt, contacts and friction (Fig. 6),
+    and which of the paper's claims hold. One thread, float64; without MuJoCo, the others alone. Exit status 1: ours left some step
+    unsolved."""
+    from pbfd_torch.bench.figure_6 import FULL, OURS, QUICK
+
+    low, high = DURATIONS
+    if duration is not None and not (math.isfinite(duration) and low <= duration <= high):
+        raise InputError(f"--duration is {duration:g} s: must be within [{low:g}, {high:g}]")
+    check_folder(out, FILES)
+    use_threads(1)
+    effort = QUICK if quick else FULL
+    report = measured(effort if duration is None else dataclasses.replace(effort, duration=duration))
+    write(report, out)
+    if as_json:
+        print(json.dumps(plain(report), allow_nan=False))
+    else:
+        print_report(report, out)
+    rows = [row for panel in ("time_steps", "contacts", "friction") for row in report[panel]]
+    raise typer.Exit(min(1, sum(row["unsolved_steps"] for row in rows if row["simulator"] in OURS)))
+
+
+def measured(effort: Effort) -> dict[str, Any]:
+    """Everything as plain data; with a progress bar on a terminal."""
+    from pbfd_torch.bench import mujoco_runs
+    from pbfd_torch.bench.figure_6 import measure, units
+    from pbfd_torch.bench.figure_6_claims import NOTES, claims
+
+    started = time.perf_counter()
+    version = mujoco_runs.version()
+    shortened = (f"at most {effort.most_steps} steps a run; in (b) Newton–Euler takes up to 4 times as many, MuJoCo all",)
+    missing = () if version else ("MuJoCo cannot be imported: not compared; pip install 'pbfd_torch[bench]' brings it",)
+    with tqdm(total=units(effort), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
+        found = measure(effort, bar.update)
+    report = {"duration_s": effort.duration, "worlds": effort.worlds, **found}
+    return {
+        "wall_s": time.perf_counter() - started,
+        "environment": environment() | {"mujoco": version},
+        "claims": claims(report),
+        **report,
+        "notes": [*NOTES, *shortened, *missing],
+    }
+
+
+def write(report: dict[str, Any], folder: Path) -> None:
+    """The three files. Raises `InputError` where they cannot be written."""
+    from pbfd_torch.bench.figure_6_claims import markdown
+    from pbfd_torch.bench.figure_6_pictures import draw
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        (folder / FILES[1]).write_text(markdown(report))
+        draw(report, folder / FILES[2])
+    except OSError as error:
+        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+
+
+def print_report(report: dict[str, Any], folder: Path) -> None:
+    """The panels, the claims, notes, and where the files are."""
+    from pbfd_torch.bench.figure_6_claims import sheets
+
+    console = Console(markup=False, emoji=False)
+    for sheet in sheets(report):
+        result = new_table(sheet.title, *(header.replace(" ", "\n", 1) for header in sheet.headers))
+        result.columns[0].no_wrap = True
+        for line in sheet.lines:
+            result.add_row(*line)
+        console.print(result, "", sep="\n")
+    console.print("the paper's claims:")
+    for claim in report["claims"]:
+        console.print(f"- {claim['paper']}: {claim['verdict'].upper()}. {claim['measured']}")
+    console.print("notes:")
+    for note in report["notes"]:
+        console.print(f"- {note}")
+    about = report["environment"]
+    peer = f"MuJoCo {about['mujoco']}" if about["mujoco"] else "no MuJoCo"
+    console.print(f"\n{report['wall_s']:.0f} s; PyTorch {about['torch']}, {peer}, {about['threads']} thread, {about['processor']}")
+    print(f"written: {', '.join(str(folder / name) for name in FILES)}")
