@@ -97,7 +97,7 @@ class _Frame(Generic[S]):
             return False
         worlds = Worlds(tuple(left.shape), index)
         now, spacing, left = self._state.take(worlds), worlds.rows(self._spacing), worlds.rows(left)
-        h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left))
+        h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left) - 1e-6)
         held = None if self._control is None else worlds.pick(self._control, 1)
         part, integrator = self._fixed.take(worlds), self._fixed.integrator
         a = part.scene.articulation

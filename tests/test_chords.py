@@ -10,15 +10,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from pbfd_torch.articulation import JointKind
 from pbfd_torch.assembly import Balance
 from pbfd_torch.chords import ChordBalance
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fittable, Fitted, fit, fitted
 from pbfd_torch.kinematics import Chord, local_twists, place, retract
+from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import skew
-from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.solvers.descent import Descent
+from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import JointDamping, JointSprings
 from pbfd_torch.terms.load import ChordLoad, StepContext
+from tests.bodies import on_world
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS, generator, random_q
 from tests.states import state_of
@@ -153,7 +159,8 @@ def test_taken_at_a_share_of_the_step(seed: int, name: str) -> None:
 
 @pytest.mark.parametrize("name", BUILDS)
 def test_slope(name: str) -> None:
-    """`slope` is the diagonal of the Jacobian: of springs at their rest, of damping at the start, of actuators within their efforts."""
+    """`slope` is the diagonal of the Jacobian: of springs at their rest, of damping at the start, of actuators within their
+    efforts."""
     s = situation(0)
     term = BUILDS[name](s)
     if isinstance(term, JointSprings):
@@ -196,3 +203,64 @@ def test_fitted_to_all_loads_together() -> None:
     assert bool((second.share[~other] == 1).all())
     assert bool(((alone.share >= 0.5) & (second.share <= 1)).all())
     assert fitted(a, [inertia], s.dt) == [inertia]
+
+
+# In motion ---------------------------------------------------------------------------------------------------------------
+
+
+def doubles(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("z", [1e-6, 0.05, 0.5, 5.0])
+@pytest.mark.parametrize(("kind", "inertia"), [(JointKind.HINGE, 0.02), (JointKind.SLIDE, 1.0)])
+def test_damped_joint(kind: JointKind, inertia: float, z: float) -> None:
+    """The velocity that a step starts with falls by e^{−z}, z = Δt c/m, in every step: to 1e-9 of the start."""
+    scene = on_world(kind, 1.0, [JointDamping(doubles(z * inertia / 0.1))])
+    simulator = Simulator(scene, 0.1, EnergyMomentum(), solver=Descent(tolerance=1e-14))
+    state = simulator.initial_state(doubles(0.3), doubles(1e-3))
+    for _ in range(4):
+        after, _ = simulator.step(state)
+        assert float((after.v - math.exp(-z) * state.v).abs()) <= 1e-9 * 1e-3
+        state = after
+
+
+def sprung(servo: bool, stiffness: float) -> Scene:
+    """A hinge with an inertia of .02 kg m², held at 0 by a spring or by a position servo."""
+    articulation = on_world(JointKind.HINGE, 1.0).articulation
+    spring = JointSprings(doubles(stiffness), articulation.rest)
+    position = Actuators.from_list(articulation, [Actuator.position("servo", "joint", kp=stiffness)])
+    return on_world(JointKind.HINGE, 1.0, [position if servo else spring])
+
+
+def released(scene: Scene, dt: float, steps: int) -> Rollout:
+    """From .3 rad, at rest."""
+    simulator = Simulator(scene, dt)
+    return simulator.rollout(simulator.initial_state(doubles(0.3)), steps=steps)
+
+
+both_springs = pytest.mark.parametrize("servo", [False, True], ids=["spring", "servo"])
+
+
+@both_springs
+def test_stiff_spring_does_not_ring(servo: bool) -> None:
+    """k = 1e6 N m/rad, Δt .05, z = 1.25e5: a step takes away all but 1/z of the stretch, and no later one gives any back."""
+    rollout = released(sprung(servo, 1e6), 0.05, 6)
+    q = rollout.q[:, 0].abs()
+    assert float(q[1]) <= 2 / 1.25e5 * 0.3
+    assert bool((q[3:] <= q[1:-2].clamp_min(1e-12)).all())
+    assert bool(rollout.solved.all())
+
+
+@both_springs
+def test_soft_spring_swings(servo: bool) -> None:
+    """q = q_0 cos(ωt), ω = 10 rad/s, over a period: to second order in Δt, the energy within 1 %."""
+    errors = []
+    for dt in (0.01, 0.005):
+        rollout = released(sprung(servo, 2.0), dt, round(0.63 / dt))
+        q, v = rollout.q[:, 0], rollout.v[:, 0]
+        errors.append(float((q - 0.3 * torch.cos(10 * rollout.time)).abs().max()))
+        energy = 0.5 * 0.02 * v * v + 0.5 * 2.0 * q * q
+        assert float((energy / energy[0] - 1).abs().max()) <= 0.01
+    assert errors[0] <= 0.01 * 0.3
+    assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.4)
