@@ -26,7 +26,7 @@ from pbfd_torch.assembly import Balance
 from pbfd_torch.dynamics import armature_diagonal, generalised_momentum, kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, calm, fall, fresh
 from pbfd_torch.kinematics import Chord, Motion, Placement, difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.inertia import Inertia
@@ -34,7 +34,6 @@ from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import Load, StepContext, Term
 from pbfd_torch.worlds import replaced
 
-HARDEST = 3.0
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included
@@ -44,15 +43,18 @@ EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included
 class Velocities(State):
     """Attributes:
     v: the velocity that the next step starts with `[*batch, nv]`.
-    push: velocity that early forces have given in the step that ended here, p = Δt M⁻¹ Σ (2θ − 1) f, `[*batch, nv]`.
-    steady: the part of it that they have also given in the step before, `[*batch, nv]`: v is short of the velocity at t_n by half
-        of it. An impact's push is no part of this: it has been given once for all.
+    push: velocity that contacts, limits and friction have given in the step that ended here, Δt M⁻¹ Σ f, `[*batch, nv]`.
+    steady: the part of the push that they have also given in the step before, `[*batch, nv]`: v is short of the velocity at t_n by
+        half of it, while an impact's has been given once for all.
+    lag: twice what v is short by besides, `[*batch, nv]`: what forces of another weight take from the loads with θ > ½, 2θ − 1 of
+        their impulse.
     average: velocity over that step, `[*batch, nv]`: with it the next step's solution is guessed.
     """
 
     v: Tensor
     push: Tensor
     steady: Tensor
+    lag: Tensor
     average: Tensor
 
 
@@ -72,21 +74,26 @@ class EnergyMomentum:
         return fitted(articulation, terms, dt)
 
     def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> Velocities:
-        """With the impulse that contacts, limits and friction give in a trial step; with none where it has more kinetic energy than
-        a fall of `HARDEST` steps: then something hits something else, and has given nothing before."""
+        """With what contacts, limits and friction give in a trial step, unless that is an impact, which has given nothing
+        before."""
         trial, dt = stepper.trial(q, v, control), stepper.step_size
         nothing = torch.zeros_like(v)
-        objective = stepper.objective(Velocities(**fresh(q), v=v, push=nothing, steady=nothing, average=v), control)
-        now = place(stepper.articulation, trial.end)
-        impulse = dt[..., None] * _Forces(objective, now).early
-        _, push = _velocities(objective, now, nothing, impulse)
-        steady = trial.solved & ((impulse * push).sum(-1) <= 2 * HARDEST**2 * _fall(objective))
-        push = torch.where(steady[..., None], push, nothing)
-        return Velocities(**fresh(q), v=v - 0.5 * push, push=push, steady=push, average=v)
+        begin = Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v)
+        objective = stepper.objective(begin, control)
+        forces = _Forces(objective, place(stepper.articulation, trial.end))
+        at = objective.step.previous
+        impulse, given = dt[..., None] * forces.rough, dt[..., None] * forces.smooth
+        inertia = mass_matrix(objective.articulation, q, objective.terms)
+        gained = dt[..., None] * trial.acceleration
+        (push,) = _solved(inertia, impulse)
+        push = torch.where((trial.solved & calm(objective, at, push))[..., None], push, nothing)
+        other = (inertia * gained[..., None, :]).sum(-1) - given
+        (lag,) = _solved(inertia, torch.where(calm(objective, at, gained)[..., None], -forces.ahead * other, nothing))
+        return replaced(begin, v=v - 0.5 * (push + lag), push=push, steady=push, lag=lag)
 
     def velocity(self, articulation: Articulation, state: Velocities, dt: Tensor) -> Tensor:
         """At t_n."""
-        return state.v + 0.5 * state.steady
+        return state.v + 0.5 * (state.steady + state.lag)
 
     def pose_rates(self, articulation: Articulation, state: Velocities, dt: Tensor) -> Tensor:
         """At t_n."""
@@ -119,9 +126,9 @@ class EnergyMomentum:
         forces, dt = _Forces(objective, now), step.dt
         rates, average = _averages(objective, state, now)
         before = Motion(step.previous, state.v).rates
-        impulse = dt[..., None] * forces.early
-        momentum = _momentum(objective, now, 2 * rates - before, 2 * average - state.v) - impulse
-        end = _ended(objective, state, now, momentum, impulse, average)
+        early = dt[..., None] * (forces.rough + forces.ahead * forces.smooth)
+        momentum = _momentum(objective, now, 2 * rates - before, 2 * average - state.v) - early
+        end = _ended(objective, state, now, momentum, forces, average)
         flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
         turned = objective.turn(dt[..., None] * average)
         gained, energy = self._gain(objective, state, end, now, forces)
@@ -134,21 +141,24 @@ class EnergyMomentum:
         a, step = objective.articulation, objective.step
         first, last = (
             kinetic_energy(a, Motion(at, v).rates) + rotor_energy(a, v, objective.terms)
-            for at, v in ((step.previous, self.velocity(a, state, step.dt)), (now, self.velocity(a, end, step.dt)))
+            for at, v in ((step.previous, state.v + 0.5 * state.steady), (now, end.v + 0.5 * end.steady))
         )
-        fall = potential_energy(step.previous, step.gravity) - potential_energy(now, step.gravity)
+        lost = potential_energy(step.previous, step.gravity) - potential_energy(now, step.gravity)
         work = step.dt * ((forces.rough + forces.smooth) * end.average).sum(-1)
-        return last - first - fall - work, first + last + _fall(objective)
+        return last - first - lost - work, first + last + fall(objective)
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
-        """Where nothing pushes: what an easier step would take of the energy is worth two shorter ones."""
-        return objective.push(objective.step.previous.q) + objective.push(q) == 0
+        """Where nothing pushes, nor would where inertia alone leads: there the energy that an easier step would take is worth two
+        shorter ones."""
+        step = objective.step
+        return objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(q) == 0
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""
         share = (new / dt)[..., None]
-        steady = share * state.steady
-        return replaced(state, v=state.v + 0.5 * (state.steady - steady), push=share * state.push, steady=steady)
+        steady, lag = share * state.steady, share * state.lag
+        v = state.v + 0.5 * (state.steady - steady + state.lag - lag)
+        return replaced(state, v=v, push=share * state.push, steady=steady, lag=lag)
 
 
 @dataclass(frozen=True)
@@ -173,29 +183,26 @@ class _PaperStep(EnergyMomentum):
         forces, h = _Forces(objective, now), step.dt[..., None]
         rates, average = _averages(objective, state, now)
         rates = torch.cat((rates[..., :3], rates[..., 3:] + 0.5 * (h * step.gravity)[..., None, :, None]), -1)
-        momentum = _momentum(objective, now, rates, average) + h * forces.late
-        return _ended(objective, state, now, momentum, h * forces.early, average), None
+        momentum = _momentum(objective, now, rates, average) + 0.5 * h * (1 - forces.ahead) * forces.smooth
+        return _ended(objective, state, now, momentum, forces, average), None
 
 
 class _Forces:
     """Generalised forces `[*batch, nv]` at the end of a step, but for inertia: `rough` ones, which come early (θ = 1), and `smooth`
-    ones, of which 2θ − 1 comes early and 1 − θ late."""
+    ones, of which 2θ − 1, `ahead` `[*, nv]`, comes early."""
 
     def __init__(self, objective: BalanceObjective, now: Placement) -> None:
         rough: list[Load] = []
         self.rough = torch.zeros_like(now.axes[..., 0])
-        self.smooth, self.early, self.late = self.rough, self.rough, self.rough
+        self.smooth, self.ahead = self.rough, self.rough
         for term, prepared in zip(objective.terms, objective.prepared, strict=True):
             if isinstance(term, Fitted):
-                force = -term.load(prepared, now).residual / term.share
-                self.smooth = self.smooth + force
-                self.early = self.early + (2 * term.share - 1) * force
-                self.late = self.late + (1 - term.share) * force
+                self.smooth = self.smooth - term.load(prepared, now).residual / term.share
+                self.ahead = 2 * term.share - 1
             elif not isinstance(term, Inertia | Armature):
                 rough.append(term.load(prepared, now))
         if rough:
             self.rough = -Balance(now, rough).residual
-            self.early = self.early + self.rough
 
 
 def _averages(objective: BalanceObjective, state: Velocities, now: Placement) -> tuple[Tensor, Tensor]:
@@ -212,25 +219,23 @@ def _momentum(objective: BalanceObjective, now: Placement, rates: Tensor, turnin
 
 
 def _ended(
-    objective: BalanceObjective, state: Velocities, now: Placement, momentum: Tensor, impulse: Tensor, average: Tensor
+    objective: BalanceObjective, state: Velocities, now: Placement, momentum: Tensor, forces: _Forces, average: Tensor
 ) -> Velocities:
-    """The state at a placement with that momentum, after early forces have given that impulse."""
-    v, push = _velocities(objective, now, momentum, impulse)
+    """The state at a placement with that momentum."""
+    h = objective.step.dt[..., None]
+    impulse = h * forces.rough
+    inertia = mass_matrix(objective.articulation, now.q, objective.terms)
+    v, push = _solved(inertia, momentum, impulse)
     # ⟨p, M p'⟩ / ⟨p, M p⟩ is how much of this push p the last one p' was
     kept, whole = (impulse * state.push).sum(-1), (impulse * push).sum(-1)
-    share = (kept / torch.where(whole > 0, whole, torch.ones_like(whole))).clamp(0, 1)
-    return Velocities(**after(objective, now.q), v=v, push=push, steady=share[..., None] * push, average=average)
+    share = (kept / torch.where(whole > 0, whole, torch.ones_like(whole))).clamp(0, 1)[..., None]
+    before = (inertia * state.v[..., None, :]).sum(-1)
+    other = momentum - before - h * forces.smooth - (1 - share) * impulse
+    (lag,) = _solved(inertia, -forces.ahead * other)
+    return Velocities(**after(objective, now.q), v=v, push=push, steady=share * push, lag=lag, average=average)
 
 
-def _fall(objective: BalanceObjective) -> Tensor:
-    """Kinetic energy [J] `[*batch]` of a fall over one step, of 1 m/s² at least."""
-    strength = torch.linalg.vector_norm(objective.step.gravity, dim=-1).clamp_min(1.0)
-    return 0.5 * objective.articulation.mass.sum(-1) * (objective.step.dt * strength) ** 2
-
-
-def _velocities(objective: BalanceObjective, now: Placement, momentum: Tensor, impulse: Tensor) -> tuple[Tensor, Tensor]:
-    """The velocities M⁻¹ of a momentum and of an impulse."""
-    inertia = mass_matrix(objective.articulation, now.q, objective.terms)
-    both, _ = torch.linalg.solve_ex(inertia, torch.stack((momentum, impulse), -1))
-    v, push = both.unbind(-1)
-    return v.contiguous(), push.contiguous()
+def _solved(inertia: Tensor, *momenta: Tensor) -> tuple[Tensor, ...]:
+    """The velocities M⁻¹ of momenta, each `[*batch, nv]`."""
+    columns, _ = torch.linalg.solve_ex(inertia, torch.stack(momenta, -1))
+    return tuple(x.contiguous() for x in columns.unbind(-1))

@@ -75,8 +75,8 @@ def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Seq
     felt = 1 / torch.linalg.inv(inertia).diagonal(dim1=-2, dim2=-1)
     slope = sum((term.slope(articulation, dt).detach() for term in able), torch.zeros_like(felt))
     share = fit((dt * dt)[..., None] * slope / felt)
-    turning = articulation.topology.turning_v.flatten()
-    share[..., turning] = 1.0  # where coordinates do not add up
+    turning = torch.zeros_like(articulation.topology.turns).index_fill(0, articulation.topology.turning_v.flatten(), True)
+    share = torch.where(turning & (slope > 0), 1.0, share)  # where coordinates do not add up
     return [Fitted(term.taken_at(share), share) if isinstance(term, Fittable) else term for term in terms]
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, calm, fresh
 from pbfd_torch.kinematics import difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.load import StepContext, Term
@@ -18,9 +18,13 @@ from pbfd_torch.worlds import replaced
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Positions(State):
-    """`q_previous`: θ_{n−1} `[*batch, nq]`."""
+    """Attributes:
+    q_previous: θ_{n−1} `[*batch, nq]`.
+    acceleration: over the last two steps `[*batch, nv]`, zero after an impact; a change of Δt needs it. None: not known, zero.
+    """
 
     q_previous: Tensor
+    acceleration: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class ImplicitEuler:
     def at_rate(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, dt: Tensor) -> Positions:
         """State at t = 0 of a motion at constant acceleration `[*batch, nv]`."""
         h = dt[..., None]
-        return Positions(**fresh(q), q_previous=retract(articulation, q, 0.5 * h * h * acceleration - h * v))
+        before = retract(articulation, q, 0.5 * h * h * acceleration - h * v)
+        return Positions(**fresh(q), q_previous=before, acceleration=acceleration)
 
     def velocity(self, articulation: Articulation, state: Positions, dt: Tensor) -> Tensor:
         """Average velocity over the step that ends at t_n (Eq. 3), `[*batch, nv]`."""
@@ -73,7 +78,11 @@ class ImplicitEuler:
 
     def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, None]:
         """See `Integrator`."""
-        return Positions(**after(objective, q), q_previous=state.q), None
+        a, h = objective.articulation, objective.step.dt[..., None]
+        gained = difference(a, state.q, q) / h - self.velocity(a, state, objective.step.dt)
+        smooth = calm(objective, objective.step.previous, gained)[..., None]
+        acceleration = torch.where(smooth, gained / h, 0.0)
+        return Positions(**after(objective, q), q_previous=state.q, acceleration=acceleration), None
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
         """None: an easier step is good enough."""
@@ -81,8 +90,10 @@ class ImplicitEuler:
 
     def resized(self, articulation: Articulation, state: Positions, dt: Tensor, new: Tensor) -> Positions:
         """See `Integrator`."""
-        share = new / dt
-        back = share[..., None] * difference(articulation, state.q, state.q_previous)
+        h, k = dt[..., None], new[..., None]
+        back = k / h * difference(articulation, state.q, state.q_previous)
+        if state.acceleration is not None:
+            back = back - 0.5 * k * (h - k) * state.acceleration
         return replaced(state, q_previous=retract(articulation, state.q, back))
 
 

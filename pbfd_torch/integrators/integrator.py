@@ -11,6 +11,8 @@ from torch import Tensor
 from typing_extensions import TypeVar
 
 from pbfd_torch.articulation import Articulation
+from pbfd_torch.dynamics import kinetic_energy
+from pbfd_torch.kinematics import Motion, Placement
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.load import StepContext, Term
@@ -133,3 +135,19 @@ def after(objective: BalanceObjective, q: Tensor) -> dict[str, Any]:
     """The fields of the state after the step of an objective that ended at q."""
     step, aftermath = objective.step, objective.aftermath(q)
     return {"q": q, "time": step.time + step.dt, "hazards": aftermath.hazards, "memory": aftermath.memory}
+
+
+HARDEST = 3.0
+
+
+def fall(objective: BalanceObjective) -> Tensor:
+    """Kinetic energy [J] `[*batch]` of the bodies' fall over one step, at 1 m/s² at least."""
+    strength = torch.linalg.vector_norm(objective.step.gravity, dim=-1).clamp_min(1.0)
+    return 0.5 * objective.articulation.mass.sum(-1) * (objective.step.dt * strength) ** 2
+
+
+def calm(objective: BalanceObjective, placement: Placement, gained: Tensor) -> Tensor:
+    """Where a velocity `[*batch, nv]` gained in a step is no impact's: it has no more energy than a fall of `HARDEST` steps,
+    `[*batch]` bool."""
+    rates = Motion(placement, gained).rates
+    return kinetic_energy(objective.articulation, rates) <= HARDEST**2 * fall(objective)
