@@ -13,12 +13,13 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from tests.states import implicit
 
 GRAVITY = 9.81
 
@@ -75,7 +76,7 @@ def on_world(kind: JointKind, mass: float, terms: Sequence[Term] = (), gravity: 
 
 def rolled_out(scene: Scene, dt: float, duration: float, q: Tensor | None = None, v: Tensor | None = None) -> Rollout:
     """A rollout from the second-order start, without control."""
-    simulator = Simulator(scene, dt)
+    simulator = implicit(scene, dt)
     return simulator.rollout(simulator.initial_state(q, v), steps=math.ceil(duration / dt - 1e-9))
 
 

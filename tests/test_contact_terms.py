@@ -29,6 +29,7 @@ from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.bodies import diagonal
+from tests.states import implicit
 
 BALL = Sphere(0.1)
 HULL = ConvexHull(np.array([[0.0, 0, 0], [0.2, 0, 0], [0, 0.2, 0], [0, 0, 0.2]]))
@@ -226,7 +227,7 @@ from pbfd_torch.terms.inertia import Inertia
 from tests.test_contact_terms import HULL, two_free
 
 def simulate(scene, q=None):
-    simulator = Simulator(scene, 0.01)
+    simulator = implicit(scene, 0.01)
     assert bool(simulator.rollout(simulator.initial_state(q), steps=2).solved.all())
 
 chain = SCENES["chain-ground"](worlds=2)
@@ -251,7 +252,7 @@ def three_balls(**rules: object) -> Simulator:
     a = Articulation.from_links([link(name, "", JointKind.FREE) for name in "abc"])
     colliders = [Collider(name, name, BALL) for name in "abc"]
     terms = contact_terms(a, colliders, (), ContactRules(NormalForce(1e5), **rules))  # type: ignore[arg-type]
-    return Simulator(Scene(a, (Inertia(), *terms), torch.zeros(3, dtype=torch.float64)), 0.01)
+    return implicit(Scene(a, (Inertia(), *terms), torch.zeros(3, dtype=torch.float64)), 0.01)
 
 
 def balls_at(simulator: Simulator, *distances: float) -> torch.Tensor:
@@ -321,7 +322,7 @@ def test_moving_further_than_detection_looked() -> None:
     a = Articulation.from_links([link("slider", "", JointKind.SLIDE), link("free", "", JointKind.FREE)])
     terms = contact_terms(a, [Collider(name, name, BALL) for name in a.link_names])
     motor = Actuators.from_list(a, [Actuator.motor("push", "slider_0")])
-    simulator = Simulator(Scene(a, (Inertia(), motor, *terms), torch.zeros(3, dtype=torch.float64)), 0.01)
+    simulator = implicit(Scene(a, (Inertia(), motor, *terms), torch.zeros(3, dtype=torch.float64)), 0.01)
     q = a.rest.repeat(3, 1)
     q[:, 2] = 1.0
     control = q.new_tensor([[0.0], [1000.0], [50.0]])

@@ -22,7 +22,7 @@ from pbfd_torch.dynamics import (
 from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rotations import quaternion_matrix
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
@@ -30,6 +30,7 @@ from pbfd_torch.terms.joint_springs import Armature, JointDamping
 from pbfd_torch.terms.load import Term
 from tests.point_bodies import PointBodies, point_bodies
 from tests.random_trees import SEEDS, generator, random_links, random_q, random_tree
+from tests.states import implicit
 
 all_trees = pytest.mark.parametrize("seed", [*SEEDS, 3])
 GRAVITY = torch.tensor([0.4, -0.2, -9.81], dtype=torch.float64)
@@ -190,7 +191,7 @@ def test_torque_is_read_off_the_solved_step(seed: int) -> None:
     motors = Actuators.from_list(articulation, [Actuator.motor(f"m{k}", name, gear=1.0 + k) for k, name in enumerate(names)])
     passive: list[Term] = [Inertia(), JointDamping(torch.full((articulation.nv,), 0.1, dtype=torch.float64))]
     scene = Scene(articulation, (*passive, motors), GRAVITY)
-    simulator = Simulator(scene, 0.01, solver=Descent(tolerance=1e-12))
+    simulator = implicit(scene, 0.01, solver=Descent(tolerance=1e-12))
     (v,) = tangents(articulation.nv, 1, seed)
     control = torch.linspace(-2.0, 3.0, motors.nu, dtype=torch.float64)
     state = simulator.initial_state(random_q(articulation, seed), 0.3 * v, control)
@@ -217,7 +218,7 @@ def test_short_steps_obey_inverse_dynamics() -> None:
     (v,) = tangents(articulation.nv, 1, 1)
     errors = []
     for dt in (2e-4, 1e-4, 5e-5):
-        simulator = Simulator(scene, dt, solver=Descent(tolerance=1e-12))
+        simulator = implicit(scene, dt, solver=Descent(tolerance=1e-12))
         state = simulator.initial_state(random_q(articulation, 1), 0.3 * v, control)
         after, _ = simulator.step(state, control)
         before = difference(articulation, state.q_previous, state.q) / dt

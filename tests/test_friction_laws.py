@@ -14,7 +14,7 @@ from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Point
 from pbfd_torch.errors import InputError
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.calibration import (
     calibrated_pbd,
@@ -34,6 +34,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.static_friction import StaticFriction
+from tests.states import implicit
 
 GRAVITY = 9.81
 DT = torch.tensor(0.01, dtype=torch.float64)
@@ -57,7 +58,7 @@ def sliding_point(law: FrictionLaw, normal_force: NormalForce, slope: float = 0.
 
 def slid(scene: Scene, dt: float, steps: int, speed: float, depth: float) -> tuple[Tensor, Tensor]:
     """Position and velocity after every step, `[steps, 2]`; every step is solved."""
-    simulator = Simulator(scene, dt)
+    simulator = implicit(scene, dt)
     state = simulator.initial_state(tensor(0.0, -depth), tensor(speed, 0.0))
     places = [state.q_previous, state.q]
     for _ in range(steps):
@@ -268,7 +269,7 @@ def test_penetration_calibrated_and_back(exponent: float) -> None:
     force = normal_force_for(mass, GRAVITY, 4, 2e-3, exponent)
     torch.testing.assert_close(rest_penetration(force, load_per_point(mass, GRAVITY, 4)), torch.full_like(mass, 2e-3))
     one = normal_force_for(1.0, GRAVITY, 1, 2e-3, exponent)
-    simulator = Simulator(sliding_point(CoulombFriction(0.5), one), 0.02)
+    simulator = implicit(sliding_point(CoulombFriction(0.5), one), 0.02)
     state = simulator.initial_state(tensor(0.0, -1e-3))
     for _ in range(200):
         state, _ = simulator.step(state)

@@ -22,8 +22,8 @@ import torch
 
 from pbfd_torch.loading import load_robot
 from pbfd_torch.models import file_setup
-from pbfd_torch.simulator import Simulator
 from tests.gymnasium_files import gymnasium_file
+from tests.states import implicit
 
 STEP, STEPS = 0.008, 250
 ROBOTS = ["hopper", "walker2d", "walker2d_v5", "ant", "half_cheetah", "humanoid"]
@@ -36,7 +36,7 @@ def test_left_to_itself(name: str) -> None:
     """Two seconds without control: all steps solved; total energy falls in every step, from that of the initial pose on; joints
     within 3 mrad (mm) of their limits; nothing deeper in the ground than 5 mm; in the end the robot lies or stands on it."""
     setup = file_setup(gymnasium_file(name))
-    simulator = Simulator(setup.scene, STEP)
+    simulator = implicit(setup.scene, STEP)
     rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), steps=STEPS)
     assert bool(rollout.solved.all()), f"{int((~rollout.solved).sum())} of {STEPS} steps unsolved"
 

@@ -32,7 +32,6 @@ EDGE = "the trial step creeps from rest: its acceleration, taken for the past, i
 PRECISION = "a step's rounding in float32 is counted from the world's origin: 1 km away it exceeds the weight, and nothing moves"
 BROKEN = {
     **{(name, "bdf2"): START for name in ("quadruped-momentum", "chain-flight", "joint-limit", "fast-impact")},
-    ("joint-limit", "variational"): START,
     ("critical-slope", "bdf2"): EDGE,
     **{("far-away", name): PRECISION for name in ALL},
 }

@@ -17,7 +17,7 @@ from pbfd_torch.models.grounds import BELT, BELT_FRICTION, RADII, RAMP_FRICTION,
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
@@ -26,6 +26,7 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.bodies import GRAVITY, at, down, rises, rolled_out
+from tests.states import implicit
 from tests.touching_bodies import stored
 
 HALF = (0.1, 0.1, 0.02)  # half extents of the sliding box [m], flat enough not to tip
@@ -253,7 +254,7 @@ def gripped(law: FrictionLaw, dt: float, duration: float) -> Rollout:
     """What the jaws hold for a while."""
     scene, q = grip(law)
     press = torch.tensor([PRESS, -PRESS], dtype=torch.float64)
-    simulator = Simulator(scene, dt)
+    simulator = implicit(scene, dt)
     steps = math.ceil(duration / dt - 1e-9)
     rollout = simulator.rollout(simulator.initial_state(q, control=press[None]), press.expand(steps, 1, 2))
     sound(rollout)

@@ -13,7 +13,6 @@ from pbfd_torch.bench.starts import scattered
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models import SCENES
 from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.directions import Newton
 from pbfd_torch.solvers.searches import Foreseen, FullStep, Trial
 from pbfd_torch.terms.contact import Contact
@@ -21,6 +20,7 @@ from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from tests.random_trees import SEEDS
 from tests.solver_problems import FunctionObjective
+from tests.states import implicit
 from tests.term_cases import CONTACTS, TERMS, Situation, TermCase, situation
 from tests.test_globalisation import Point
 from tests.test_kinematics import tangent
@@ -157,7 +157,7 @@ def test_first_length_where_the_outlook_fails() -> None:
 def test_landing_chains_take_few_evaluations(dt: float, most: float) -> None:
     """64 chains from random starts, 2 s: mean evaluations a step, every one of them solved."""
     setup = SCENES["chain-ground"](worlds=64)
-    simulator = Simulator(setup.scene, dt)
+    simulator = implicit(setup.scene, dt)
     rollout = simulator.rollout(simulator.initial_state(*scattered(setup)), steps=round(2.0 / dt))
     assert bool(rollout.solved.all())
     assert float(rollout.evaluations.double().mean()) <= most

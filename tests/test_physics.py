@@ -23,7 +23,7 @@ from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_matrix, rotation_log
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
@@ -36,6 +36,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from tests.bodies import GRAVITY, at, box_inertia, diagonal, down, free_body, on_ground, on_world, rises, rolled_out
 from tests.random_trees import generator, random_inertia
+from tests.states import implicit
 
 HALF = (0.1, 0.1, 0.05)  # half extents of the test box [m]
 STIFF = NormalForce(1e8)
@@ -64,7 +65,7 @@ def test_rotation_oracle(seed: int, turn: float) -> None:
     link = Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.7, com=(0.2, -0.1, 0.3), inertia=rows)
     articulation = Articulation.from_links([link])
     scene = Scene(articulation, (Inertia(),), torch.zeros(3, dtype=torch.float64))
-    simulator = Simulator(scene, 0.1, solver=Descent(tolerance=1e-13))
+    simulator = implicit(scene, 0.1, solver=Descent(tolerance=1e-13))
     v = torch.randn(6, dtype=torch.float64, generator=random)
     v[3:] *= turn / 0.1 / torch.linalg.vector_norm(v[3:])
     state = simulator.initial_state(at(0.5, (0.3, 0.2, -0.7)), v)
@@ -123,7 +124,7 @@ def test_linear_momentum_under_internal_torques() -> None:
     setup = chain_free()
     articulation = setup.scene.articulation
     motors = Actuators.from_list(articulation, [Actuator.motor(n, n) for n in articulation.joint_names[1:]])
-    simulator = Simulator(Scene(articulation, (Inertia(), motors), setup.scene.gravity), 0.01)
+    simulator = implicit(Scene(articulation, (Inertia(), motors), setup.scene.gravity), 0.01)
     controls = 0.02 * torch.randn(50, 1, motors.nu, dtype=torch.float64, generator=generator(3))
     rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), controls)
     linear = rollout.linear_momentum
@@ -178,7 +179,7 @@ def test_mass_spring_damper_armature(dt: float) -> None:
 
     terms = (Armature(one(armature)), JointDamping(one(damping)), JointSprings(one(stiffness), one(rest)))
     scene = on_world(JointKind.SLIDE, mass, terms, gravity)
-    simulator = Simulator(scene, dt)
+    simulator = implicit(scene, dt)
     state = simulator.initial_state(one(0.5), one(-1.0))
     rollout = simulator.rollout(state, steps=20)
     x = torch.cat((state.q_previous, rollout.q[:, 0]))

@@ -13,7 +13,6 @@ from pbfd_torch.bench.starts import scattered
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import SCENES
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers import lock_step
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -21,7 +20,7 @@ from pbfd_torch.solvers.named import OnSquares, lbfgs
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.workers import Workers
 from tests.random_trees import generator
-from tests.states import state_of
+from tests.states import implicit, state_of
 
 ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor" and f.name != "lanes"]
 
@@ -34,7 +33,7 @@ def assert_equal(a: Rollout, b: Rollout) -> None:
 def test_asynchronous_without_fallbacks() -> None:
     """A plain descent that gives up after 10 evaluations: what it leaves unsolved stays so, as in lock step."""
     setup = SCENES["chain-ground"](worlds=8)
-    simulator = Simulator(setup.scene, 0.05, solver=Descent(max_evaluations=10), halvings=0)
+    simulator = implicit(setup.scene, 0.05, solver=Descent(max_evaluations=10), halvings=0)
     state = simulator.initial_state(*scattered(setup))
     straight = simulator.rollout(state, steps=10)
     assert not bool(straight.solved.all())
@@ -46,7 +45,7 @@ def test_asynchronous_trajectories_are_those_of_lock_step(dtype: torch.dtype) ->
     """12 falling chains through their landing, with fallbacks among them: bitwise the same record, counts and statuses included;
     every lane's evaluations went where they were needed, or nearly so."""
     setup = SCENES["chain-ground"](worlds=12, dtype=dtype)
-    simulator = Simulator(setup.scene, 0.05, solver=Fallbacks(Descent(max_evaluations=60)))
+    simulator = implicit(setup.scene, 0.05, solver=Fallbacks(Descent(max_evaluations=60)))
     state = simulator.initial_state(*scattered(setup))
     straight = simulator.rollout(state, steps=14)
     own_pace = AsynchronousRollout(simulator, state, 14)
@@ -63,7 +62,7 @@ def test_every_world_has_the_control_of_its_own_step() -> None:
     """Random controls of the hopper, one per world and step: the trajectories of lock step, to the tolerance (rolling contacts
     round by a world's place in memory)."""
     setup = SCENES["hopper"](worlds=12)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     state = simulator.initial_state(*scattered(setup, bend=0.05))
     controls = 2 * torch.rand(20, 12, setup.scene.nu, dtype=torch.float64, generator=generator(3)) - 1
     straight = simulator.rollout(state, controls)
@@ -75,7 +74,7 @@ def test_every_world_has_the_control_of_its_own_step() -> None:
 def test_policy_sees_each_world_at_its_own_step() -> None:
     """A policy of step, q and v, row by row, against the same law applied in lock step."""
     setup = SCENES["hopper"](worlds=6)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     state = simulator.initial_state(*scattered(setup, bend=0.05))
 
     def policy(step: Tensor, q: Tensor, v: Tensor) -> Tensor:
@@ -93,7 +92,7 @@ def test_one_call_evaluates_every_world_once(monkeypatch: pytest.MonkeyPatch) ->
     number of calls is the largest number of evaluations that one world needed."""
     monkeypatch.setattr("pbfd_torch.asynchronous.FEWEST_LANES", 10**9)
     setup = SCENES["box-slide"](worlds=5)
-    simulator = Simulator(setup.scene, 0.05)
+    simulator = implicit(setup.scene, 0.05)
     state = simulator.initial_state(setup.q, setup.v)
     own_pace = AsynchronousRollout(simulator, state, 12)
     for _ in range(12):
@@ -108,7 +107,7 @@ def test_asynchronous_saves_what_max_over_mean_predicts() -> None:
     """256 falling chains of random starts: lock step without compaction costs Σ_k max_w evaluations for every world; the
     asynchronous schedule beats it by the factor max/mean, to 15 %."""
     setup = SCENES["chain-ground"](worlds=256)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     state = simulator.initial_state(*scattered(setup))
     own_pace = AsynchronousRollout(simulator, state, 60)
     rollout = own_pace.finish()
@@ -121,7 +120,7 @@ def test_asynchronous_saves_what_max_over_mean_predicts() -> None:
 def test_compaction_changes_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lock step with and without compaction: bitwise the same, at fewer evaluations spent."""
     setup = SCENES["chain-ground"](worlds=24)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     state = simulator.initial_state(*scattered(setup))
     for _ in range(12):
         state, _ = simulator.step(state)
@@ -135,7 +134,7 @@ def test_compaction_changes_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_interrupted_asynchronous_rollout_keeps_the_steps_of_all_worlds() -> None:
     """Ctrl-C in the middle: the steps that every world has made are kept, bitwise those of the whole rollout."""
     setup = SCENES["chain-fixed"](worlds=3)
-    simulator = Simulator(setup.scene, 0.05)
+    simulator = implicit(setup.scene, 0.05)
     state = simulator.initial_state(*scattered(setup))
     done = 0
 
@@ -154,7 +153,7 @@ def test_interrupted_asynchronous_rollout_keeps_the_steps_of_all_worlds() -> Non
 def test_worker_processes_give_the_numbers_of_one() -> None:
     """Five boxes with a μ each over two workers: bitwise the record of a single process, at each use of the pool."""
     setup = SCENES["box-slide"](worlds=5)
-    simulator = Simulator(setup.scene, 0.05)
+    simulator = implicit(setup.scene, 0.05)
     state = simulator.initial_state(setup.q, setup.v)
     straight = simulator.rollout(state, steps=6)
     with Workers(2) as workers:
@@ -167,7 +166,7 @@ def test_worker_processes_give_the_numbers_of_one() -> None:
 def test_bad_input_is_named() -> None:
     """The message gives value and choices."""
     setup = SCENES["box-slide"](worlds=2)
-    simulator = Simulator(setup.scene, 0.05)
+    simulator = implicit(setup.scene, 0.05)
     state = simulator.initial_state(setup.q, setup.v)
     with pytest.raises(InputError, match="steps is 0: must be ≥ 1"):
         AsynchronousRollout(simulator, state, 0)
@@ -176,6 +175,6 @@ def test_bad_input_is_named() -> None:
     with pytest.raises(InputError, match="must be \\[worlds, nq\\]"):
         AsynchronousRollout(simulator, state_of(state.q[0], state.q_previous[0]), 4)
     with pytest.raises(InputError, match="the solver is a OnSquares: must be a Descent or Fallbacks"):
-        AsynchronousRollout(Simulator(setup.scene, 0.05, solver=OnSquares(lbfgs())), state, 4)
+        AsynchronousRollout(implicit(setup.scene, 0.05, solver=OnSquares(lbfgs())), state, 4)
     with pytest.raises(InputError, match="count is 0: must be ≥ 1"):
         Workers(0)

@@ -30,6 +30,7 @@ from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from tests.bodies import GRAVITY, at, diagonal, down, free_body, on_ground, on_world, rises, rolled_out
+from tests.states import implicit
 
 BATCHES: list[tuple[int, ...]] = [(), (3,), (2, 3)]
 all_batches = pytest.mark.parametrize("batch", BATCHES, ids=str)
@@ -623,7 +624,7 @@ def test_position_servo_sags(dt: float) -> None:
 def test_velocity_servo_lags(dt: float) -> None:
     """Under a load F a velocity servo runs at u + F/kv, which it nears by v_{n+1} = (v_n + Δt (kv u + F)/m)/(1 + Δt kv/m)."""
     mass, kv, u = 2.0, 15.0, 0.8
-    simulator = Simulator(arm(Actuator.velocity("v", "joint", kv=kv), gravity=doubles(3.0, 0.0, 0.0)), dt)
+    simulator = implicit(arm(Actuator.velocity("v", "joint", kv=kv), gravity=doubles(3.0, 0.0, 0.0)), dt)
     rollout = simulator.rollout(simulator.initial_state(), doubles(u).expand(round(4.0 / dt), 1))
     v = rollout.v[:, 0]
     expected = (v[:-1] + dt * (kv * u + 6.0) / mass) / (1 + dt * kv / mass)

@@ -29,6 +29,7 @@ from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.random_trees import generator
 from tests.solver_problems import METHODS, ROOT_METHODS, changed
+from tests.states import implicit
 
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 AGREEMENT = 1e-8
@@ -57,7 +58,7 @@ def _chain(links: int, dtype: torch.dtype, free: bool) -> Simulator:
     if free:
         ground = HalfSpace()
         terms.append(Contact.between(articulation, chain_colliders(links), ground, NormalForce(STIFFNESS), CoulombFriction(0.5)))
-    return Simulator(Scene(articulation, tuple(terms), torch.tensor([0.0, 0.0, -9.81], dtype=dtype)), 0.02)
+    return implicit(Scene(articulation, tuple(terms), torch.tensor([0.0, 0.0, -9.81], dtype=dtype)), 0.02)
 
 
 def _step(simulator: Simulator, q: Tensor, v: Tensor | None, steps: int) -> Step:
@@ -88,7 +89,7 @@ def _pendulum(dtype: torch.dtype) -> Step:
 
 def _boxes(dtype: torch.dtype) -> Step:
     setup = box_slide(5, dtype)
-    return _step(Simulator(setup.scene, setup.dt), setup.q, setup.v, 5)
+    return _step(implicit(setup.scene, setup.dt), setup.q, setup.v, 5)
 
 
 def _short_landing(links: int, dtype: torch.dtype) -> Step:
@@ -101,7 +102,7 @@ def _short_landing(links: int, dtype: torch.dtype) -> Step:
 
 def _long_landing(dtype: torch.dtype) -> Step:
     setup = chain_ground(1, dtype)
-    return _landing(Simulator(setup.scene, setup.dt), setup.q, setup.v)
+    return _landing(implicit(setup.scene, setup.dt), setup.q, setup.v)
 
 
 STEPS: dict[str, Callable[[torch.dtype], Step]] = {

@@ -24,7 +24,7 @@ from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from tests.random_trees import generator
-from tests.states import state_of
+from tests.states import implicit, state_of
 
 # few evaluations a stage: detours and exhausted budgets become common and stay cheap
 HASTY = Fallbacks(Descent(max_evaluations=8), Descent(max_evaluations=12), detours=(Continuation(((1.0, 1e-2),)),))
@@ -73,7 +73,7 @@ def test_world_of_a_batch_equals_the_world_alone(dtype: torch.dtype) -> None:
     halved steps (in float64) and exhausted budgets among them; also as a single world without batch dimension."""
     setup = chain_ground(64, dtype)
     halvings = 1 if dtype == torch.float64 else 0
-    simulator = Simulator(setup.scene, 0.02, solver=HASTY, halvings=halvings)
+    simulator = implicit(setup.scene, 0.02, solver=HASTY, halvings=halvings)
     q, v = scattered(setup, 0)
     _, whole = run(simulator, q, v, 20)
     happened = set(whole.status.flatten().tolist())
@@ -92,10 +92,10 @@ def test_world_of_a_batch_equals_the_world_alone(dtype: torch.dtype) -> None:
 def test_world_with_its_own_parameters_equals_the_world_alone(dtype: torch.dtype) -> None:
     """The sliding boxes have one μ each: world k of 5 is bitwise a scene of its own with that μ, 20 steps."""
     setup = box_slide(5, dtype)
-    _, whole = run(Simulator(setup.scene, 0.02), setup.q, setup.v, 20)
+    _, whole = run(implicit(setup.scene, 0.02), setup.q, setup.v, 20)
     for k in (0, 3):
         single = box_slide(k + 1, dtype)
-        _, some = run(Simulator(single.scene, 0.02), single.q, single.v, 20)
+        _, some = run(implicit(single.scene, 0.02), single.q, single.v, 20)
         assert torch.equal(some.q[:, k], whole.q[:, k])
 
 
@@ -106,10 +106,10 @@ def test_world_with_its_own_gravity_equals_the_world_alone(dtype: torch.dtype) -
     q, v = scattered(setup, 7)
     q[:, 2] -= 0.3
     gravity = torch.stack((0.17 * setup.scene.gravity, 2.5 * setup.scene.gravity))
-    _, whole = run(Simulator(dataclasses.replace(setup.scene, gravity=gravity), 0.02, solver=HASTY, halvings=0), q, v, 10)
+    _, whole = run(implicit(dataclasses.replace(setup.scene, gravity=gravity), 0.02, solver=HASTY, halvings=0), q, v, 10)
     for k in range(2):
         scene = dataclasses.replace(setup.scene, gravity=gravity[k])
-        _, alone = run(Simulator(scene, 0.02, solver=HASTY, halvings=0), q[k], v[k], 10)
+        _, alone = run(implicit(scene, 0.02, solver=HASTY, halvings=0), q[k], v[k], 10)
         assert_same(whole, (slice(None), k), alone)
 
 
@@ -117,7 +117,7 @@ def test_world_with_its_own_gravity_equals_the_world_alone(dtype: torch.dtype) -
 def test_permuted_batch_gives_the_permuted_result(dtype: torch.dtype) -> None:
     """The order of the worlds does not matter, bitwise, over 6 steps."""
     setup = chain_ground(16, dtype)
-    simulator = Simulator(setup.scene, 0.02, solver=HASTY, halvings=1)
+    simulator = implicit(setup.scene, 0.02, solver=HASTY, halvings=1)
     q, v = scattered(setup, 1)
     order = torch.randperm(16, generator=generator(2))
     _, straight = run(simulator, q, v, 6)
@@ -128,7 +128,7 @@ def test_permuted_batch_gives_the_permuted_result(dtype: torch.dtype) -> None:
 def test_batch_dimensions_are_only_a_shape() -> None:
     """Worlds `[6]` and the same worlds as `[2, 3]` come out bitwise the same."""
     setup = chain_ground(6)
-    simulator = Simulator(setup.scene, 0.02, solver=HASTY, halvings=1)
+    simulator = implicit(setup.scene, 0.02, solver=HASTY, halvings=1)
     q, v = scattered(setup, 3)
     flat, _ = run(simulator, q, v, 6)
     shaped, _ = run(simulator, q.view(2, 3, -1), v.view(2, 3, -1), 6)
@@ -140,7 +140,7 @@ def test_same_run_twice() -> None:
 
     def once() -> tuple[Positions, Solution]:
         setup = chain_ground(8)
-        return run(Simulator(setup.scene, 0.02, solver=HASTY, halvings=1), *scattered(setup, 4), 10)
+        return run(implicit(setup.scene, 0.02, solver=HASTY, halvings=1), *scattered(setup, 4), 10)
 
     (first, first_solution), (second, second_solution) = once(), once()
     assert torch.equal(first.q, second.q)
@@ -153,7 +153,7 @@ def test_same_run_twice() -> None:
 def test_poisoned_state_harms_no_other_world(dtype: torch.dtype, where: str) -> None:
     """NaN in one world's state: its status says NON_FINITE, all other worlds are bitwise as without it, over 10 steps."""
     setup = chain_ground(6, dtype)
-    simulator = Simulator(setup.scene, 0.02, solver=HASTY, halvings=1)
+    simulator = implicit(setup.scene, 0.02, solver=HASTY, halvings=1)
     clean = simulator.initial_state(*scattered(setup, 5))
     q, q_previous = clean.q.clone(), clean.q_previous.clone()
     (q if where == "q" else q_previous)[2, 9] = math.nan
@@ -175,7 +175,7 @@ def test_poisoned_control_harms_no_other_world(bad: float) -> None:
     setup = chain_fixed(4)
     articulation = setup.scene.articulation
     motors = Actuators.from_list(articulation, [Actuator.motor("m", articulation.joint_names[0])])
-    simulator = Simulator(Scene(articulation, (Inertia(), motors), setup.scene.gravity), 0.01)
+    simulator = implicit(Scene(articulation, (Inertia(), motors), setup.scene.gravity), 0.01)
     state = simulator.initial_state(setup.q, setup.v)
     control = torch.full((4, 1), 0.3, dtype=torch.float64)
     poisoned = control.clone()
@@ -189,7 +189,7 @@ def test_poisoned_control_harms_no_other_world(bad: float) -> None:
 def test_solved_step_as_guess() -> None:
     """The end of a solved step, given as the guess of the same step: 0 iterations, 1 evaluation, bitwise the same."""
     setup = chain_ground(3)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     q, v = scattered(setup, 6, bend=0.01)
     state, _ = run(simulator, q, v, 2)
     after, solution = simulator.step(state)
@@ -204,7 +204,7 @@ def test_solved_step_as_guess() -> None:
 def test_compaction_changes_no_world(lagged: bool) -> None:
     """Of 64 chains 60 have long landed or still fall: the schedule drops their lanes, and no world's numbers change by a bit."""
     setup = chain_ground(64)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     q, v = scattered(setup, 8, bend=0.02)
     q[:60, 2] += 5.0
     state, _ = run(simulator, q, v, 1)
@@ -251,7 +251,7 @@ class Waits(TorchDispatchMode):
 def test_a_round_waits_for_nothing(solver: Descent) -> None:
     """`Descent.advance` on a landing chain asks the device for no number: on a GPU it could be recorded as a graph."""
     setup = chain_ground(4)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = implicit(setup.scene, 0.02)
     q, v = scattered(setup, 9)
     state, _ = run(simulator, q, v, 14)
     with torch.no_grad():

@@ -14,7 +14,7 @@ from pbfd_torch.contact.shapes import Collider, Point, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import place
 from pbfd_torch.objective import EnergyObjective
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
@@ -24,6 +24,7 @@ from pbfd_torch.worlds import Worlds
 from tests.bodies import GRAVITY, at, diagonal, down, free_body, rolled_out
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import SEEDS
+from tests.states import implicit
 from tests.term_cases import no_load
 from tests.test_obstacles import SOLIDS, Meeting, meeting
 
@@ -54,7 +55,7 @@ def test_torque(share: float) -> None:
     for height, normal in ((RADIUS - 1e-3, 1e6 * 1e-6), (RADIUS + 1e-3, 0.0)):
         articulation, contact = _ball()
         term = TorsionalFriction(contact, MU, PATCH, 0.1)
-        simulator = Simulator(Scene(articulation, (Inertia(), contact, term), down()), 0.01)
+        simulator = implicit(Scene(articulation, (Inertia(), contact, term), down()), 0.01)
         before, after = at(height), at(height, (0.0, 0.0, share * 0.1 * 0.01))
         state = dataclasses.replace(simulator.initial_state(), q=before, q_previous=before)
         step = simulator.objective(state).step
@@ -109,7 +110,7 @@ def test_worlds_are_apart_and_lagged_friction_has_an_energy() -> None:
 
     articulation, contact = _ball()
     scene = Scene(articulation, (Inertia(), contact, TorsionalFriction(contact, MU, PATCH)), down())
-    simulator = Simulator(scene, 0.01)
+    simulator = implicit(scene, 0.01)
     q = at(RADIUS - 1e-3, (0.0, 0.0, 0.01))
     objective = simulator.objective(simulator.initial_state(at(RADIUS - 1e-3)))
     lagged = objective.lagged(q)

@@ -73,6 +73,7 @@ class Recorder:
             "residual_norm": solution.residual_norm,
             "fallbacks": solution.fallbacks,
             "hazards": torch.zeros_like(solution.status),
+            "substeps": torch.ones_like(solution.status),
             "contact_point": torch.cat([none, *(x.points for x in at)], -2),
             "contact_depth": torch.cat([none[..., 0], *(x.depth for x in at)], -1),
             "contact_force": torch.cat([none, *(x.force for x in touched)], -2),

@@ -22,7 +22,7 @@ from pbfd_torch.contact.candidates import Finder, Slots
 from pbfd_torch.contact.obstacle import Carrier
 from pbfd_torch.errors import ContactOverflowError
 from pbfd_torch.hazards import Hazard, Overflow
-from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.kinematics import Motion, Placement
 from pbfd_torch.rotations import rotation_log, skew
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.checks import require_non_negative, require_positive
@@ -124,7 +124,7 @@ class BodyContact:
         dt = step.dt[..., None]
         bounce = None
         if self.restitution is not None:
-            coasting = torch.cat((place(step.previous.articulation, step.target_q).poses, obstacles), -3)
+            coasting = torch.cat((step.coasting_poses, obstacles), -3)
             bounce = self.restitution.bounce(_gaps(slots, bodies), _gaps(slots, ahead), dt, _gaps(slots, coasting))
         grip = self.grip[slots.pair]
         return PreparedBodyContact(dt, slots, grip, bodies, reach, obstacles, start, turn @ first[..., :3], anchor, bounce)

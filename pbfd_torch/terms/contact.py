@@ -23,7 +23,7 @@ from pbfd_torch.contact.obstacle import Carrier, Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.contact.surface import Surface, Tangent
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.kinematics import Motion, Placement
 from pbfd_torch.rotations import quaternion_matrix, rotation_log
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_outlook import contact_outlook
@@ -205,7 +205,7 @@ class Contact:
             prepared = dataclasses.replace(prepared, surface=tangent)
         if self.restitution is None:
             return prepared
-        coasting = self._centers(place(step.previous.articulation, step.target_q))
+        coasting = self._grouping.mapped(step.coasting_poses, self.position)
         gaps = [-self._at(prepared, points, None).depth for points in (centers, free, coasting)]
         return dataclasses.replace(prepared, bounce=self.restitution.bounce(gaps[0], gaps[1], dt, gaps[2]))
 

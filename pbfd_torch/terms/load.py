@@ -43,6 +43,13 @@ class StepContext:
     share: Tensor | None = None
     guess: Tensor | None = None
 
+    @property
+    def coasting_poses(self) -> Tensor:
+        """Where the links would end without any force, as far as gravity is all there is, `[*batch, nlink, 4, 4]`."""
+        poses = self.target_poses.clone()
+        poses[..., :3, 3] -= (self.dt * self.dt)[..., None, None] * self.gravity[..., None, :]
+        return poses
+
     def take(self, worlds: Worlds) -> StepContext:
         """The step of some worlds."""
         before = self.previous
