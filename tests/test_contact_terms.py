@@ -227,7 +227,7 @@ from pbfd_torch.terms.inertia import Inertia
 from tests.test_contact_terms import HULL, two_free
 
 def simulate(scene, q=None):
-    simulator = implicit(scene, 0.01)
+    simulator = Simulator(scene, 0.01)
     assert bool(simulator.rollout(simulator.initial_state(q), steps=2).solved.all())
 
 chain = SCENES["chain-ground"](worlds=2)

@@ -27,7 +27,7 @@ EXPECTED = {
 
 
 # what does not hold yet, and why; a case that comes to hold fails here
-START = "the trial step that the start takes its acceleration from loses spin by itself: the body sets out too fast"
+START = "a past of constant acceleration in the joints is no free motion of the bodies: momentum and energy are off by O(Δt²)"
 EDGE = "the trial step creeps from rest: its acceleration, taken for the past, is a speed that nothing slows at the cone itself"
 PRECISION = "a step's rounding in float32 is counted from the world's origin: 1 km away it exceeds the weight, and nothing moves"
 BROKEN = {
