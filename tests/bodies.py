@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,15 +12,16 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Shape
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
-from pbfd_torch.simulator import Scene
+from pbfd_torch.simulator import Scene, Simulator
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
-from tests.states import implicit
 
 GRAVITY = 9.81
 
@@ -74,9 +76,16 @@ def on_world(kind: JointKind, mass: float, terms: Sequence[Term] = (), gravity: 
     return Scene(articulation, (Inertia(), *terms), torch.zeros(3, dtype=torch.float64) if gravity is None else gravity)
 
 
-def rolled_out(scene: Scene, dt: float, duration: float, q: Tensor | None = None, v: Tensor | None = None) -> Rollout:
-    """A rollout from the second-order start, without control."""
-    simulator = implicit(scene, dt)
+def rolled_out(
+    scene: Scene,
+    dt: float,
+    duration: float,
+    q: Tensor | None = None,
+    v: Tensor | None = None,
+    integrator: Integrator[Any] | None = None,
+) -> Rollout:
+    """A rollout from the second-order start, without control; by implicit Euler, of which most is known."""
+    simulator: Simulator[Any] = Simulator(scene, dt, integrator or ImplicitEuler())
     return simulator.rollout(simulator.initial_state(q, v), steps=math.ceil(duration / dt - 1e-9))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -13,6 +14,9 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.motion import Conveyor, Lift, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Point, Shape, Sphere
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -198,10 +202,11 @@ def _peaks(height: Tensor) -> list[float]:
 
 @pytest.mark.parametrize(("dt", "height", "tolerance"), [(0.002, 0.1, 0.02), (0.01, 0.3, 0.005), (0.02, 0.5, 0.005)])
 @pytest.mark.parametrize(("shape", "share"), [(Sphere(0.05), 0.6), (Sphere(0.05), 1.0), (Box(HALF), 0.8)])
-def test_rebound(shape: Shape, share: float, dt: float, height: float, tolerance: float) -> None:
+@pytest.mark.parametrize("integrator", [ImplicitEuler(), EnergyMomentum()], ids=["implicit Euler", "energy-momentum"])
+def test_rebound(integrator: Integrator[Any], shape: Shape, share: float, dt: float, height: float, tolerance: float) -> None:
     """Dropped from h, a body rebounds to e² h, within `tolerance` h: what the contact gives way at C⊥ = 1e8."""
     scene = on(HalfSpace(), shape, CoulombFriction(0.5), restitution=Restitution(share))
-    rollout = rolled_out(scene, dt, 2.2 * math.sqrt(2 * height / GRAVITY), at(0.05 + height))
+    rollout = rolled_out(scene, dt, 2.2 * math.sqrt(2 * height / GRAVITY), at(0.05 + height), integrator=integrator)
     assert bool(rollout.solved.all())
     grid = GRAVITY * dt**2 / 8  # how far the top of a flight is above the steps beside it
     assert _peaks(rollout.center_of_mass[:, 2] - 0.05)[0] == pytest.approx(height * share**2, abs=tolerance * height + grid)
