@@ -109,7 +109,7 @@ class _Frame(Generic[S]):
 
         error = apart(a, coarse.q, end.q)
         broken = third.status == int(Status.NON_FINITE)
-        shortest = h <= self._simulator.shortest
+        shortest = h <= 1.001 * self._simulator.shortest  # not but for rounding
         taken = broken | shortest | ((error <= self._simulator.accuracy) & second.solved & third.solved)
         factor = (SAFETY * (self._simulator.accuracy / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
         factor = torch.where(taken, factor, factor.clamp_max(0.5))
