@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Generic
+from typing import Generic, Self
 
 import torch
 from torch import Tensor
@@ -50,7 +50,6 @@ class AdaptiveSimulator(Simulator[S]):
         self.shortest = max(dt / 4096, 2 * SHORTEST_STEP) if shortest is None else float(shortest)
         if not 2 * SHORTEST_STEP <= self.shortest <= max(dt, 2 * SHORTEST_STEP):
             raise InputError(f"shortest is {shortest} s: must be from {2 * SHORTEST_STEP} s to dt, {dt} s")
-
         self._fixed = Simulator(scene, dt, self.integrator, self.solver, halvings=0)
 
     def _step(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective]:
@@ -60,10 +59,10 @@ class AdaptiveSimulator(Simulator[S]):
                 pass
             return frame.finish()
 
-    def take(self, worlds: Worlds) -> AdaptiveSimulator[S]:
+    def take(self, worlds: Worlds) -> Self:
         """The simulator of some worlds."""
-        part = AdaptiveSimulator(self.scene.take(worlds), self.dt, self.accuracy, self.integrator, self.solver, self.shortest)
-        part._batch = self._fixed.take(worlds)._batch
+        part = super().take(worlds)
+        part._fixed = self._fixed.take(worlds)
         return part
 
 

@@ -259,8 +259,13 @@ def force_scale(articulation: Articulation, gravity: float | Tensor) -> Tensor:
     gravity [m/s²] (one number or `[*batch]`) taken as at least 1, so that weightless scenes have a scale too."""
     strength = torch.as_tensor(gravity, dtype=articulation.dtype, device=articulation.device).clamp_min(1.0)
     weight = articulation.mass.sum(-1, keepdim=True) * strength[..., None]
-    lever = torch.where(articulation.topology.turns, reach(articulation)[..., None], 1.0)
-    return (weight * lever).detach()
+    return (weight * lever(articulation)).detach()
+
+
+def lever(articulation: Articulation) -> Tensor:
+    """What a force at the articulation's reach does to each degree of freedom, `[*, nv]`: the reach [m] for rotations, 1 for
+    translations."""
+    return torch.where(articulation.topology.turns, reach(articulation)[..., None], 1.0)
 
 
 def reach(articulation: Articulation) -> Tensor:

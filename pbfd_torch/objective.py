@@ -11,7 +11,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, force_scale, reach
+from pbfd_torch.articulation import Articulation, force_scale, lever, reach
 from pbfd_torch.assembly import Balance
 from pbfd_torch.dynamics import armature_diagonal
 from pbfd_torch.errors import InputError
@@ -176,8 +176,7 @@ class BalanceObjective:
         for term, prepared in zip(self.terms, self.prepared, strict=True):
             if isinstance(term, Pushing):
                 total = total + term.push(prepared, placement)
-        lever = torch.where(self.articulation.topology.turns, reach(self.articulation)[..., None], 1.0)
-        return total / (self.scale / lever)[..., 0]
+        return total / (self.scale / lever(self.articulation))[..., 0]
 
     def _with(self, terms: Sequence[Term]) -> Self:
         return dataclasses.replace(self, terms=terms)
@@ -233,6 +232,5 @@ def _prepared(terms: Sequence[Term], step: StepContext, memory: tuple[Tensor, ..
 def inertia_rounding(articulation: Articulation, terms: Sequence[Term], step: StepContext, far: Tensor) -> Tensor:
     """Rounding error `[*batch, nv]` left in the inertial forces [N, N m]: they are κ m times differences of positions x that were
     rounded to ε|x|. It grows with 1/Δt² and with the distance `far` `[*batch]` [m] from the world's origin."""
-    lever = force_scale(articulation, 1.0)
-    moved = far[..., None] * lever + armature_diagonal(articulation, terms)
+    moved = far[..., None] * force_scale(articulation, 1.0) + armature_diagonal(articulation, terms)
     return 8 * torch.finfo(far.dtype).eps * step.weight[..., None] * moved

@@ -7,7 +7,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, cast
+from typing import Generic, Protocol, Self, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -102,6 +102,38 @@ class Scene:
         """Length of the control vector."""
         return sum(term.nu for term in self.terms if isinstance(term, Actuators))
 
+    def placed(self, q: Tensor | None, v: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Configuration `[*batch, nq]` and velocity `[*batch, nv]` of all worlds, quaternions at unit norm, from those given for
+        one or for all; None: the rest configuration, and rest. Raises `InputError` for wrong shapes, dtypes, devices or NaN."""
+        a = self.articulation
+        q = a.rest if q is None else self._checked(q, a.nq, "q")
+        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
+        parameters = (self.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
+        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], *parameters)
+        return a.topology.normalized(q.expand(*batch, a.nq)), v.expand(*batch, a.nv)
+
+    def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
+        a = self.articulation
+        if value.ndim == 0 or value.shape[-1] != length:
+            raise InputError(f"{name} has shape {tuple(value.shape)}: must end in ({length},)")
+        if value.dtype != a.dtype or value.device != a.device:
+            raise InputError(f"{name} is {value.dtype} on {value.device}: must be {a.dtype} on {a.device}")
+        if not bool(torch.isfinite(value).all()):
+            raise InputError(f"{name} holds NaN or infinity")
+        return value
+
+    def step_count(self, controls: Tensor | None, steps: int | None) -> int:
+        """Of a rollout with these controls, or without any; raises `InputError` where the two do not agree."""
+        if controls is None:
+            if steps is None or steps < 1:
+                raise InputError(f"steps is {steps}: must be ≥ 1 where there are no controls")
+            return steps
+        if controls.ndim < 2 or controls.shape[-1] != self.nu or len(controls) == 0:
+            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps ≥ 1, *batch, {self.nu}]")
+        if steps is not None and steps != len(controls):
+            raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
+        return len(controls)
+
     def take(self, worlds: Worlds) -> Scene:
         """The same scene with the parameters of some worlds."""
         terms = tuple(term.take(worlds) for term in self.terms)
@@ -134,8 +166,6 @@ class Simulator(Generic[S]):
         self.halvings = halvings
         self.step_size = torch.tensor(dt, dtype=a.dtype, device=a.device)
         self._terms = self.integrator.adapted(a, scene.terms, self.step_size)
-        parameters = (scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
-        self._batch = torch.broadcast_shapes(*parameters)
         self._scale = force_scale(a, torch.linalg.vector_norm(scene.gravity, dim=-1))
 
     @property
@@ -149,14 +179,9 @@ class Simulator(Generic[S]):
 
         The start is of second order, or of first order in a world whose trial step is unsolved, if the integrator needs one. Raises
         `InputError` for wrong shapes, dtypes, devices or NaN."""
-        a = self.scene.articulation
-        q = a.rest if q is None else self._checked(q, a.nq, "q")
-        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
-        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
-        q, v = q.expand(*batch, a.nq), v.expand(*batch, a.nv)
-        q = a.topology.normalized(q)
+        q, v = self.scene.placed(q, v)
         start = self.integrator.start(self, q, v, control)
-        return replaced(start, memory=blank_memory(self.scene.terms, tuple(batch)))
+        return replaced(start, memory=blank_memory(self.scene.terms, tuple(q.shape[:-1])))
 
     @property
     def articulation(self) -> Articulation:
@@ -172,16 +197,6 @@ class Simulator(Generic[S]):
         acceleration, _ = torch.linalg.solve_ex(mass_matrix(a, q, self.scene.terms), force[..., None])
         solved = solution.solved
         return Trial(end.q, torch.where(solved[..., None], acceleration.squeeze(-1), 0.0), solved)
-
-    def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
-        a = self.scene.articulation
-        if value.ndim == 0 or value.shape[-1] != length:
-            raise InputError(f"{name} has shape {tuple(value.shape)}: must end in ({length},)")
-        if value.dtype != a.dtype or value.device != a.device:
-            raise InputError(f"{name} is {value.dtype} on {value.device}: must be {a.dtype} on {a.device}")
-        if not bool(torch.isfinite(value).all()):
-            raise InputError(f"{name} holds NaN or infinity")
-        return value
 
     def objective(self, state: S, control: Tensor | None = None) -> BalanceObjective:
         """The balance of forces that the step from `state` solves."""
@@ -233,14 +248,13 @@ class Simulator(Generic[S]):
     def _may_halve(self, times: int) -> bool:
         return times <= self.halvings and self.dt / 2**times >= SHORTEST_STEP
 
-    def take(self, worlds: Worlds) -> Simulator[S]:
+    def take(self, worlds: Worlds) -> Self:
         """The simulator of some worlds."""
         part = copy.copy(self)
         part.scene = self.scene.take(worlds)
         part._terms = [term.take(worlds) for term in self._terms]
         part._scale = worlds.pick(self._scale, 1)
         part.step_size = worlds.pick(self.step_size, 0)
-        part._batch = torch.Size(()) if len(self._batch) == 0 else worlds.index.shape
         return part
 
     def sized(self, step_size: Tensor) -> Simulator[S]:
@@ -317,7 +331,7 @@ class Simulator(Generic[S]):
         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
         with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed.
         Raises `ContactOverflowError`, which holds the steps done, where the scene asks for it."""
-        count = self._count(controls, steps)
+        count = self.scene.step_count(controls, steps)
         recorder = Recorder(self.scene, self.integrator, self.dt, state)
         try:
             for k in range(count):
@@ -332,17 +346,6 @@ class Simulator(Generic[S]):
             error.rollout = recorder.finish() if recorder.steps else None
             raise
         return recorder.finish()
-
-    def _count(self, controls: Tensor | None, steps: int | None) -> int:
-        if controls is None:
-            if steps is None or steps < 1:
-                raise InputError(f"steps is {steps}: must be ≥ 1 where there are no controls")
-            return steps
-        if controls.ndim < 2 or controls.shape[-1] != self.scene.nu or len(controls) == 0:
-            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps ≥ 1, *batch, {self.scene.nu}]")
-        if steps is not None and steps != len(controls):
-            raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
-        return len(controls)
 
 
 T = TypeVar("T")

@@ -13,9 +13,8 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
-from pbfd_torch.errors import InputError
 
 FILES = ("friction.json", "fig5.png")
 VALUES, QUICK_VALUES = 21, 9
@@ -64,12 +63,12 @@ def write(report: dict[str, Any], folder: Path) -> None:
     """The two files. Raises `InputError` where they cannot be written."""
     from pbfd_torch.bench.figure_5 import draw
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
-        draw(report["curves"], folder / FILES[1])
-    except OSError as error:
-        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    write_files(
+        folder,
+        report,
+        FILES[0],
+        lambda: draw(report["curves"], folder / FILES[1]),
+    )
 
 
 def print_report(report: dict[str, Any], folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, chosen, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
@@ -54,16 +54,6 @@ def hard_cases(
     raise typer.Exit(min(1, report["failed"]))
 
 
-def chosen(option: str, text: str, valid: Iterable[str], read: Callable[[str], str] = str.strip) -> list[str]:
-    """The names in a list separated by commas, in the order of the valid ones; all of them where it is empty. Raises
-    `InputError`."""
-    names = [read(name) for name in text.split(",") if name.strip()]
-    known = list(valid)
-    if not set(names) <= set(known) or (text and not names):
-        raise InputError(f"{option} is '{text}': must be from {', '.join(known)}, separated by commas")
-    return [name for name in known if not names or name in names]
-
-
 def _as_seconds(text: str) -> str:
     """A number in the form that the time steps are written in; any other text as it is."""
     try:
@@ -100,12 +90,12 @@ def write(results: Sequence[Result], report: dict[str, Any], folder: Path) -> No
     """The two files. Raises `InputError` where they cannot be written."""
     from pbfd_torch.bench.hard_cases_table import markdown
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
-        (folder / FILES[1]).write_text(markdown(report, results))
-    except OSError as error:
-        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    write_files(
+        folder,
+        report,
+        FILES[0],
+        lambda: (folder / FILES[1]).write_text(markdown(report, results)),
+    )
 
 
 def print_report(results: Sequence[Result], report: dict[str, Any], folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,9 +13,8 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, chosen, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
-from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
 
 if TYPE_CHECKING:
@@ -41,8 +40,8 @@ def precision(
     from pbfd_torch.bench.precision_scenes import CASES
 
     effort = QUICK if quick else FULL
-    chosen_scenes = chosen("--scenes", scenes, CASES) if scenes else effort.scenes
-    chosen_integrators = chosen("--integrators", integrators, INTEGRATORS)
+    chosen_scenes = chosen("--scenes", scenes, CASES, what="names ") if scenes else effort.scenes
+    chosen_integrators = chosen("--integrators", integrators, INTEGRATORS, what="names ")
     check_folder(out, FILES)
     use_threads(1)
     report = measured(chosen_scenes, chosen_integrators, effort)
@@ -52,16 +51,6 @@ def precision(
     else:
         print_report(report, out)
     raise typer.Exit(min(1, sum(row["unsolved_steps"] for scene in report["scenes"].values() for row in scene["rows"])))
-
-
-def chosen(option: str, text: str, valid: Iterable[str]) -> list[str]:
-    """The names in a list separated by commas, in the order of the valid ones; all of them where it is empty. Raises
-    `InputError`."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in names if name not in set(valid)]
-    if unknown or (text and not names):
-        raise InputError(f"{option} is '{text}': must be names from {', '.join(valid)}, separated by commas")
-    return [name for name in valid if not names or name in names]
 
 
 def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) -> dict[str, Any]:
@@ -97,14 +86,14 @@ def write(report: dict[str, Any], folder: Path) -> None:
     from pbfd_torch.bench.precision_levels import markdown
     from pbfd_torch.bench.precision_pictures import draw_steps, draw_work
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
-        (folder / FILES[1]).write_text(markdown(report))
-        draw_work(report, folder / FILES[2])
-        draw_steps(report, folder / FILES[3])
-    except OSError as error:
-        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    write_files(
+        folder,
+        report,
+        FILES[0],
+        lambda: (folder / FILES[1]).write_text(markdown(report)),
+        lambda: draw_work(report, folder / FILES[2]),
+        lambda: draw_steps(report, folder / FILES[3]),
+    )
 
 
 def print_report(report: dict[str, Any], folder: Path) -> None:

@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
 from pbfd_torch.errors import InputError
 
@@ -81,13 +81,13 @@ def write(report: dict[str, Any], folder: Path) -> None:
     from pbfd_torch.bench.figure_6_claims import markdown
     from pbfd_torch.bench.figure_6_pictures import draw
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
-        (folder / FILES[1]).write_text(markdown(report))
-        draw(report, folder / FILES[2])
-    except OSError as error:
-        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    write_files(
+        folder,
+        report,
+        FILES[0],
+        lambda: (folder / FILES[1]).write_text(markdown(report)),
+        lambda: draw(report, folder / FILES[2]),
+    )
 
 
 def print_report(report: dict[str, Any], folder: Path) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain
+from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import Choices, load_setup, use_threads
 from pbfd_torch.errors import InputError
 from pbfd_torch.simulator import SHORTEST_STEP
@@ -122,13 +122,13 @@ def write(report: dict[str, Any], folder: Path) -> None:
     from pbfd_torch.bench.pictures import draw_figure_4, draw_table_1
 
     table = report["table_1"]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / FILES[0]).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
-        draw_figure_4(report["figure_4"]["chains"], folder / FILES[1])
-        draw_table_1(table["sizes"], table["fit_sizes"], table["variants"], folder / FILES[2])
-    except OSError as error:
-        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
+    write_files(
+        folder,
+        report,
+        FILES[0],
+        lambda: draw_figure_4(report["figure_4"]["chains"], folder / FILES[1]),
+        lambda: draw_table_1(table["sizes"], table["fit_sizes"], table["variants"], folder / FILES[2]),
+    )
 
 
 def print_report(report: dict[str, Any], folder: Path) -> None:

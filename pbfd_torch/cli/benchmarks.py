@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import math
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,27 @@ def check_folder(folder: Path, files: Sequence[str]) -> None:
         existing = existing.parent
     if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in files):
         raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
+
+
+def chosen(option: str, text: str, valid: Iterable[str], read: Callable[[str], str] = str.strip, what: str = "") -> list[str]:
+    """The values in a list separated by commas, in the order of the valid ones; all of them where it is empty. `what` they are is
+    said in the message. Raises `InputError`."""
+    given = [read(part) for part in text.split(",") if part.strip()]
+    known = list(valid)
+    if not set(given) <= set(known) or (text and not given):
+        raise InputError(f"{option} is '{text}': must be {what}from {', '.join(known)}, separated by commas")
+    return [name for name in known if not given or name in given]
+
+
+def write_files(folder: Path, report: dict[str, Any], name: str, *others: Callable[[], object]) -> None:
+    """The report as JSON under that name, and whatever else the `others` write. Raises `InputError` where that cannot be done."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        for write in others:
+            write()
+    except OSError as error:
+        raise InputError(f"cannot write to '{folder}': {error.strerror or error}") from error
 
 
 def environment() -> dict[str, Any]:

@@ -104,9 +104,6 @@ class NewtonEuler:
         self._count += 0 if self._limited is None else 2 * len(self._limited)
         strength = torch.linalg.vector_norm(scene.gravity, dim=-1).clamp_min(1.0)
         self._scale = a.mass.sum(-1).sqrt() * strength * self.step_size
-        self._batch = torch.broadcast_shapes(
-            scene.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3]
-        )
         self._check_terms()
 
     def _check_terms(self) -> None:
@@ -124,22 +121,8 @@ class NewtonEuler:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest), as
         in `Simulator.initial_state`. The control does not matter here. Raises `InputError` for wrong shapes, dtypes, devices or
         NaN."""
-        a = self.scene.articulation
-        q = a.rest if q is None else self._checked(q, a.nq, "q")
-        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
-        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], self._batch)
-        q = a.topology.normalized(q.expand(*batch, a.nq))
-        return VelocityState(q, v.expand(*batch, a.nv), torch.zeros_like(q[..., 0]), q.new_zeros((*batch, self._count, 3)))
-
-    def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
-        a = self.scene.articulation
-        if value.ndim == 0 or value.shape[-1] != length:
-            raise InputError(f"{name} has shape {tuple(value.shape)}: must end in ({length},)")
-        if value.dtype != a.dtype or value.device != a.device:
-            raise InputError(f"{name} is {value.dtype} on {value.device}: must be {a.dtype} on {a.device}")
-        if not bool(torch.isfinite(value).all()):
-            raise InputError(f"{name} holds NaN or infinity")
-        return value
+        q, v = self.scene.placed(q, v)
+        return VelocityState(q, v, torch.zeros_like(q[..., 0]), q.new_zeros((*q.shape[:-1], self._count, 3)))
 
     def _context(self, state: VelocityState, control: Tensor | None) -> StepContext:
         """The step as terms see it: inertia would end it where everything coasts to."""
@@ -229,7 +212,7 @@ class NewtonEuler:
 
         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
         with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed."""
-        count = self._steps(controls, steps)
+        count = self.scene.step_count(controls, steps)
         recorder = Recorder(self.scene, self.dt, state.q, state.v, state.time)
         try:
             for k in range(count):
@@ -241,17 +224,6 @@ class NewtonEuler:
             if recorder.steps == 0:
                 raise
         return recorder.finish()
-
-    def _steps(self, controls: Tensor | None, steps: int | None) -> int:
-        if controls is None:
-            if steps is None or steps < 1:
-                raise InputError(f"steps is {steps}: must be ≥ 1 where there are no controls")
-            return steps
-        if controls.ndim < 2 or controls.shape[-1] != self.scene.nu or len(controls) == 0:
-            raise InputError(f"controls have shape {tuple(controls.shape)}: must be [steps ≥ 1, *batch, {self.scene.nu}]")
-        if steps is not None and steps != len(controls):
-            raise InputError(f"steps is {steps} but there are {len(controls)} controls: give one of the two")
-        return len(controls)
 
 
 def _load(term: Term, step: StepContext) -> JointLoad:

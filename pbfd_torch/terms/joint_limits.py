@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, force_scale, reach
+from pbfd_torch.articulation import Articulation, force_scale, lever
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
@@ -55,9 +54,7 @@ class JointLimits:
 
     def push(self, prepared: None, placement: Placement) -> Tensor:
         """See `Pushing`."""
-        articulation = placement.articulation
-        lever = torch.where(articulation.topology.turns, reach(articulation)[..., None], 1.0)
-        return (self.load(prepared, placement).residual.abs() / lever).sum(-1)
+        return (self.load(prepared, placement).residual.abs() / lever(placement.articulation)).sum(-1)
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
