@@ -34,6 +34,8 @@ from pbfd_torch.terms.load import (
 )
 from pbfd_torch.worlds import Worlds
 
+NEGLIGIBLE = 0.1  # of the scale, at most, may be left to rounding
+
 
 @dataclass(frozen=True, eq=False)
 class BalanceObjective:
@@ -89,7 +91,9 @@ class BalanceObjective:
     def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
         """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`; the rounding is that of inertia and, for worlds that are not solved with
         it, of what the Jacobian makes of coordinates that are rounded themselves: stiff friction feels a displacement of ε|x|."""
-        strict = weighted_error(evaluation.residual, self.scale, self.rounding, tolerance)
+        whole = weighted_error(evaluation.residual, self.scale, torch.zeros_like(self.rounding), tolerance)
+        least = tolerance / NEGLIGIBLE * whole
+        strict = torch.maximum(weighted_error(evaluation.residual, self.scale, self.rounding, tolerance), least)
         solved = strict <= tolerance
         # what is in the host's own memory it may look at; asking a device would make it wait
         if strict.device.type == "cpu" and bool(solved.numpy().all()):
@@ -97,7 +101,7 @@ class BalanceObjective:
         epsilon = 2 * torch.finfo(self.scale.dtype).eps
         felt = (evaluation.jacobian.abs() * self.extent[..., None, :]).sum(-1)
         lenient = weighted_error(evaluation.residual, self.scale, self.rounding + epsilon * felt, tolerance)
-        return torch.where(solved, strict, lenient)
+        return torch.where(solved, strict, torch.maximum(lenient, least))
 
     def retract(self, q: Tensor, step: Tensor) -> Tensor:
         """q moved by the tangent vector `step`."""

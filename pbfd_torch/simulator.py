@@ -25,7 +25,7 @@ from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.solvers.fallbacks import Fallbacks, brisk, merged
+from pbfd_torch.solvers.fallbacks import Fallbacks, merged
 from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.actuators import Actuators
@@ -171,7 +171,7 @@ class Simulator(Generic[S]):
     @property
     def first_solver(self) -> Solver:
         """What a step is given to first: no long detours where there is an easier step."""
-        return brisk() if self.integrator.easier and isinstance(self.solver, Fallbacks) else self.solver
+        return self.solver.brisk if self.integrator.easier and isinstance(self.solver, Fallbacks) else self.solver
 
     def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).

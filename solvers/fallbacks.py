@@ -17,9 +17,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.directions import Newton
 from pbfd_torch.solvers.objective import Objective, Relaxable, Solution, Status, unsolved_worlds
-from pbfd_torch.solvers.searches import Backtracking
 
 
 class Detour(Protocol):
@@ -65,21 +63,6 @@ class WarmStart:
 
 
 @dataclass(frozen=True)
-class Downhill:
-    """The way down ½‖r‖², which may end in a valley without a root, but passes where the work along Newton's steps misleads."""
-
-    max_evaluations: int = 40
-    tolerance: float = 1e-4
-    kind: int = 0
-    status: Status = Status.WARM_STARTED
-
-    def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
-        """See `Detour`."""
-        down = Descent(Newton(), Backtracking(), max_evaluations=self.max_evaluations)
-        return climbed(down, self.tolerance, [lambda _: objective], start)
-
-
-@dataclass(frozen=True)
 class Continuation:
     """Stages (width of friction as a multiple, stiffness as a share of the full one), from easy to hard: wide friction does not
     yet decide between sticking and slipping, and soft contacts let a step pass that stiff ones bend too much."""
@@ -101,6 +84,7 @@ class Continuation:
 
 WIDTHS = Continuation(((1000.0, 1.0), (100.0, 1.0), (10.0, 1.0)))
 STIFFNESSES = Continuation(((1.0, 1e-3), (1.0, 1e-2), (1.0, 1e-1)), tolerance=1e-2)
+SOON = 40  # evaluations
 
 
 @dataclass(frozen=True)
@@ -116,6 +100,12 @@ class Fallbacks:
     last: Descent = field(default_factory=lambda: Descent(max_evaluations=100))
     detours: tuple[Detour, ...] = (WarmStart(), WIDTHS, STIFFNESSES)
     stage: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
+
+    @property
+    def brisk(self) -> Descent:
+        """For a step that has an easier one to fall back on: the direct way, given up soon. What it does not solve by then seldom
+        has a solution, and no detour leads to one."""
+        return dataclasses.replace(self.direct, max_evaluations=min(SOON, self.direct.max_evaluations))
 
     def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
         """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours."""
@@ -138,11 +128,6 @@ class Fallbacks:
             return solution
         again = self.last.solve(objective.take(index), guess.reshape(-1, guess.shape[-1])[index])
         return merged(solution, index, [again], None, Status.SOLVED)
-
-
-def brisk() -> Fallbacks:
-    """For a step that has an easier one to fall back on: no long detours."""
-    return Fallbacks(Descent(max_evaluations=60), Descent(max_evaluations=30), (Downhill(),))
 
 
 def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int | None, status: Status) -> Solution:

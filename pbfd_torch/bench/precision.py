@@ -15,22 +15,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.adaptive import AdaptiveSimulator
 from pbfd_torch.bench import mujoco_runs
 from pbfd_torch.bench.precision_scenes import CASES, Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.timing import Progress
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 
-OURS, PEER = "pbfd_torch", "MuJoCo"
+OURS, PEER, ADAPTIVE = "pbfd_torch", "MuJoCo", "adaptive"
 SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
 NOTES = (
-    "error: root mean square of the distance from the reference over what is observed; Δt: held to it, no step is adapted",
+    "error: root mean square of the distance from the reference over what is observed; Δt: held to it, but for `adaptive`",
     (
         "time of ours: bare steps; each world of a batch starts from another time of the motion, spread evenly over it, so that "
         "the worlds are in different phases and wait for the slowest; a single world is timed from several such times (box: μ = .1)"
+    ),
+    (
+        "adaptive: energy–momentum steps of every world's own choice for an accuracy, Δt: their mean; time: of the whole recorded "
+        "motion (box: all μ at once)"
     ),
     "time of MuJoCo: the whole motion in C, the shortest of up to 3 runs; it has no batch: one world's time stands for any number",
     (
@@ -57,6 +64,7 @@ class Effort:
         seconds: spent on the time of a single world and of a batch.
         pieces: of the motion, that a single world is timed over; a batch is timed over as much, all at once.
         repeats: of MuJoCo's runs, at most.
+        accuracies: [m] of the adaptive runs.
         scenes: that are run where none are asked for.
     """
 
@@ -69,19 +77,24 @@ class Effort:
     pieces: int = 8
     repeats: int = 3
     scenes: tuple[str, ...] = tuple(CASES)
+    accuracies: tuple[float, ...] = (1e-2, 1e-3, 1e-4, 1e-5)
 
     def steps_of(self, case: Case) -> tuple[float, ...]:
         """Ours for this scene [s]."""
         return tuple(dt for dt in self.steps if dt >= case.smallest_step)
 
+    def accuracies_with(self, integrators: Sequence[str]) -> tuple[float, ...]:
+        """Those of the adaptive runs, which are the default integrator's, beside these [m]."""
+        return self.accuracies if EnergyMomentum in map(INTEGRATORS.get, integrators) else ()
+
     def units(self, case: Case, integrators: Sequence[str], peers: Sequence[str]) -> int:
         """How often `measure_scene` tells its progress."""
         ours = len(integrators) * (2 * len(self.steps_of(case)) + (2 if case.exact is None else 0))
-        return ours + len(peers) * len(self.peer_steps)
+        return ours + len(peers) * len(self.peer_steps) + len(self.accuracies_with(integrators))
 
 
 FULL = Effort()
-QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 0.005, 0.0005, 8, (0.1, 0.1), 1, 1, ("chain-fixed", "box-slide"))
+QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 0.005, 0.0005, 8, (0.1, 0.1), 1, 1, ("chain-fixed", "box-slide"), (1e-2, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,18 +209,36 @@ def our_row(case: Case, motion: Motion, reference: Reference, other: Reference |
     away = {} if other is None or case.exact is not None else {"error_to_mujoco": case.error(motion.track, other.value)}
     batches = dict(zip((1, effort.worlds), effort.seconds, strict=True))
     return {
-        "simulator": OURS,
+        **_ours(case, motion.track, rollout, reference),
         "integrator": motion.integrator,
         "dt": motion.dt,
-        "error": case.error(motion.track, reference.value),
-        "diverged": not bool(torch.isfinite(motion.track.q).all()),
         "world_steps": rollout.status.numel(),
-        "unsolved_steps": int((~rollout.solved).sum()),
-        "fallbacks": dict(zip(FALLBACKS, rollout.fallbacks.sum((0, 1)).tolist(), strict=True)),
-        "evaluations": float(rollout.evaluations.double().mean()),
         "ms_per_s": {str(worlds): our_cost(case, motion, worlds, seconds, effort.pieces) for worlds, seconds in batches.items()},
         **_told(case, motion.track),
         **away,
+    }
+
+
+def adaptive_row(case: Case, accuracy: float, reference: Reference) -> dict[str, Any]:
+    """One run with steps of the worlds' own."""
+    setup = case.setup(case.tracked_worlds)
+    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, case.frame, accuracy)
+    frames = step_count(case.duration, case.frame)
+    controls = case.controls(case.frame, case.frame * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
+    start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
+    began = time.perf_counter()
+    rollout = simulator.rollout(start, controls, frames if controls is None else None)
+    wall = time.perf_counter() - began
+    track = Track.of_rollout(setup, rollout)
+    steps = int(rollout.substeps.sum())
+    return {
+        **_ours(case, track, rollout, reference),
+        "integrator": ADAPTIVE,
+        "dt": case.duration * setup.worlds / steps,
+        "accuracy_m": accuracy,
+        "world_steps": steps,
+        "ms_per_s": {"1": 1e3 * wall / case.duration / setup.worlds},
+        **_told(case, track),
     }
 
 
@@ -224,6 +255,18 @@ def peer_row(case: Case, integrator: str, dt: float, reference: Reference, repea
         "unsolved_steps": 0,
         "ms_per_s": {"1": math.nan if diverged else 1e3 * seconds / case.duration},
         **_told(case, track),
+    }
+
+
+def _ours(case: Case, track: Track, rollout: Rollout, reference: Reference) -> dict[str, Any]:
+    """What is told of every motion of ours."""
+    return {
+        "simulator": OURS,
+        "error": case.error(track, reference.value),
+        "diverged": not bool(torch.isfinite(track.q).all()),
+        "unsolved_steps": int((~rollout.solved).sum()),
+        "fallbacks": dict(zip(FALLBACKS, rollout.fallbacks.sum((0, 1)).tolist(), strict=True)),
+        "evaluations": float(rollout.evaluations.sum() / rollout.substeps.sum()),
     }
 
 
@@ -250,6 +293,9 @@ def measure_scene(
     rows = []
     for motion in motions:
         rows.append(our_row(case, motion, reference, other, effort))
+        progress(1)
+    for accuracy in effort.accuracies_with(integrators):
+        rows.append(adaptive_row(case, accuracy, reference))
         progress(1)
     if other is not None:
         for name in peers:

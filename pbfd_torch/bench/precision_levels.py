@@ -54,7 +54,7 @@ def level_table(scene: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _way(row: Row | None, worlds: str) -> str:
-    return "–" if row is None else f"{row['integrator']} {row['dt']:g} s: {row['ms_per_s'][worlds]:.3g}"
+    return "–" if row is None else f"{row['integrator']} {row['dt']:.3g} s: {row['ms_per_s'][worlds]:.3g}"
 
 
 def losses(scenes: Mapping[str, Any]) -> list[str]:
@@ -110,12 +110,12 @@ def _cells(row: Row, scene: Mapping[str, Any]) -> list[str]:
     ours = row["simulator"] == OURS
     times = row["ms_per_s"]
     return [
-        *(row["simulator"], row["integrator"], f"{row['dt']:g}"),
+        *(row["simulator"], row["integrator"], f"{row['dt']:.3g}"),
         "diverged" if row["diverged"] else f"{row['error']:.3g} {scene['unit']}",
         f"{row['unsolved_steps']}/{row['world_steps']}" if ours else "",
         "/".join(map(str, row["fallbacks"].values())) if ours else "",
         "" if row["diverged"] else f"{times['1']:.3g}",
-        f"{times[batch]:.3g}" if ours else "",
+        f"{times[batch]:.3g}" if batch in times else "",
         also,
     ]
 

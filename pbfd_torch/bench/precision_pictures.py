@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pbfd_torch.bench.precision import OURS, PEER
+from pbfd_torch.bench.precision import ADAPTIVE, OURS, PEER
 from pbfd_torch.bench.precision_levels import Row, batch_of
 
 FLOOR = 1e-12  # smaller errors are drawn here
@@ -36,7 +36,8 @@ def draw_work(report: Mapping[str, Any], path: Path) -> None:
             if name[0] == PEER:
                 _curve(axes, rows, lambda row: row["ms_per_s"]["1"], style)
                 continue
-            _curve(axes, rows, lambda row: row["ms_per_s"][batch], style)
+            if name[1] != ADAPTIVE:
+                _curve(axes, rows, lambda row: row["ms_per_s"][batch], style)
             _curve(axes, rows, lambda row: row["ms_per_s"]["1"], style | {"alpha": 0.35, "linestyle": "--"})
         axes.set_xlabel("wall ms per simulated s and world")
 
@@ -65,7 +66,7 @@ def _curves(scene: Mapping[str, Any], integrators: list[str]) -> Curves:
     found: Curves = {}
     for row in scene["rows"]:
         name = (row["simulator"], row["integrator"])
-        ours = {"color": COLORS[integrators.index(name[1]) % len(COLORS)], "marker": "o"} if name[0] == OURS else {}
+        ours = {"color": COLORS[[*integrators, ADAPTIVE].index(name[1]) % len(COLORS)], "marker": "o"} if name[0] == OURS else {}
         found.setdefault(name, ([], ours or dict(PEER_STYLES[name[1]])))[0].append(row)
     return found
 

@@ -51,6 +51,11 @@ class Case:
         """Worlds that the error is taken over: the box slides under every μ."""
         return len(boxes.SLIDING_FRICTION) if self.scene == "box-slide" else 1
 
+    @property
+    def frame(self) -> float:
+        """The longest step of the adaptive runs [s]; a control is held for it."""
+        return 0.1 if self.control is None else 0.01
+
     def setup(self, worlds: int) -> Setup:
         """The scene, world k like world k modulo `tracked_worlds`."""
         return SCENES[self.scene](worlds=worlds)

@@ -10,22 +10,27 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions, fallen
+from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
-from pbfd_torch.kinematics import difference, place, retract
+from pbfd_torch.kinematics import Motion, difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.load import StepContext, Term
 from pbfd_torch.worlds import replaced
 
+Past = tuple[Tensor, Tensor, Tensor]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FourPositions(State):
+class FourPoses(State):
     """Attributes:
-    history: θ_{n−1}, θ_{n−2}, θ_{n−3}, each `[*batch, nq]`.
+    history: link poses T_{n−1}, T_{n−2}, T_{n−3}, each `[*batch, nlink, 4, 4]`. Those before the start fit no joints: they are on
+        the bodies' parabolas, which keeps momentum.
+    moves: the last three displacements, the latest first, each `[*batch, nv]`.
     push: how hard contacts and limits pushed at θ_n, in weights, `[*batch]`; NaN: not known, and no jump to whatever comes.
     """
 
-    history: tuple[Tensor, Tensor, Tensor]
+    history: Past
+    moves: Past
     push: Tensor
 
 
@@ -38,7 +43,7 @@ class Bdf2:
     jump: float = 0.3
 
     @property
-    def easier(self) -> Sequence[Integrator[FourPositions]]:
+    def easier(self) -> Sequence[Integrator[FourPoses]]:
         """Implicit Euler."""
         return (_Drop(),)
 
@@ -46,56 +51,75 @@ class Bdf2:
         """The terms themselves, all implicit."""
         return terms
 
-    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> FourPositions:
+    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> FourPoses:
         """A past of constant acceleration, that of a trial step."""
-        past = _past(stepper.articulation, q, v, stepper.trial(q, v, control).acceleration, stepper.step_size)
-        return FourPositions(**fresh(q), history=past, push=torch.full_like(q[..., 0], torch.nan))
+        a, h = stepper.articulation, stepper.step_size
+        acceleration = stepper.trial(q, v, control).acceleration
+        now = place(a, q)
+        motion = Motion(now, v)
+        curved = motion.accelerations + Motion(now, acceleration).rates
+        return FourPoses(
+            **fresh(q),
+            history=_before(now.poses, motion.rates, curved, h),
+            moves=_moved(v, acceleration, h),
+            push=torch.full_like(q[..., 0], torch.nan),
+        )
 
-    def velocity(self, articulation: Articulation, state: FourPositions, dt: Tensor) -> Tensor:
+    def velocity(self, articulation: Articulation, state: FourPoses, dt: Tensor) -> Tensor:
         """That of BDF2 at t_n."""
-        last, before, _ = _moves(articulation, state)
+        last, before, _ = state.moves
         return (1.5 * last - 0.5 * before) / dt[..., None]
 
-    def pose_rates(self, articulation: Articulation, state: FourPositions, dt: Tensor) -> Tensor:
+    def pose_rates(self, articulation: Articulation, state: FourPoses, dt: Tensor) -> Tensor:
         """Those of BDF2 at t_n."""
-        now, last, before = (place(articulation, q).poses[..., :3, :] for q in (state.q, *state.history[:2]))
-        return (1.5 * (now - last) - 0.5 * (last - before)) / dt[..., None, None, None]
+        last, before, _ = _steps(place(articulation, state.q).poses, state)
+        return (1.5 * last - 0.5 * before)[..., :3, :] / dt[..., None, None, None]
 
     def context(
-        self, articulation: Articulation, state: FourPositions, dt: Tensor, gravity: Tensor, control: Tensor | None
+        self, articulation: Articulation, state: FourPoses, dt: Tensor, gravity: Tensor, control: Tensor | None
     ) -> StepContext:
         """T̂ = (24T_n − 22T_{n−1} + 8T_{n−2} − T_{n−3})/9 + 4Δt²/9 [0 | g]."""
-        placements = [place(articulation, q) for q in (state.q, *state.history)]
+        now = place(articulation, state.q)
         square = dt * dt
-        target = placements[0].poses + _extrapolated(*(a.poses - b.poses for a, b in pairwise(placements)))
+        target = now.poses + _extrapolated(*_steps(now.poses, state))
         return StepContext(
             dt=dt,
-            previous=placements[0],
+            previous=now,
             weight=9 / (4 * square),
             target_poses=fallen(target, (square * (4 / 9))[..., None, None] * gravity[..., None, :]),
-            target_q=retract(articulation, state.q, _extrapolated(*_moves(articulation, state))),
+            target_q=retract(articulation, state.q, _extrapolated(*state.moves)),
             control=control,
             time=state.time,
             gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> tuple[FourPositions, Tensor | None]:
+    def advance(self, objective: BalanceObjective, state: FourPoses, q: Tensor) -> tuple[FourPoses, Tensor | None]:
         """See `Integrator`."""
-        first, second, _ = state.history
-        push = objective.push(q)
-        end = FourPositions(**after(objective, q), history=(state.q, first, second), push=push)
+        step, push = objective.step, objective.push(q)
+        end = FourPoses(
+            **after(objective, q),
+            history=(step.previous.poses, *state.history[:2]),
+            moves=(difference(objective.articulation, state.q, q), *state.moves[:2]),
+            push=push,
+        )
         return end, (push - state.push).abs() > self.jump
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
         """None: an easier step is good enough."""
         return torch.zeros_like(q[..., 0], dtype=torch.bool)
 
-    def resized(self, articulation: Articulation, state: FourPositions, dt: Tensor, new: Tensor) -> FourPositions:
+    def resized(self, articulation: Articulation, state: FourPoses, dt: Tensor, new: Tensor) -> FourPoses:
         """A past of constant acceleration, that of the last two steps."""
-        last, before, _ = _moves(articulation, state)
-        acceleration = (last - before) / (dt * dt)[..., None]
-        v = self.velocity(articulation, state, dt)
-        return replaced(state, history=_past(articulation, state.q, v, acceleration, new))
+        now = place(articulation, state.q).poses
+        last, before, _ = _steps(now, state)
+        rates, square = self.pose_rates(articulation, state, dt), dt * dt
+        curved = (last - before)[..., :3, :] / square[..., None, None, None]
+        acceleration = (state.moves[0] - state.moves[1]) / square[..., None]
+        return replaced(
+            state,
+            history=_before(now, rates, curved, new),
+            moves=_moved(self.velocity(articulation, state, dt), acceleration, new),
+        )
 
 
 @dataclass(frozen=True)
@@ -103,35 +127,60 @@ class _Drop(Bdf2):
     """A step of implicit Euler that forgets what was before it."""
 
     @property
-    def easier(self) -> Sequence[Integrator[FourPositions]]:
+    def easier(self) -> Sequence[Integrator[FourPoses]]:
         """None."""
         return ()
 
     def context(
-        self, articulation: Articulation, state: FourPositions, dt: Tensor, gravity: Tensor, control: Tensor | None
+        self, articulation: Articulation, state: FourPoses, dt: Tensor, gravity: Tensor, control: Tensor | None
     ) -> StepContext:
-        """Implicit Euler's."""
-        last = Positions(q=state.q, q_previous=state.history[0], time=state.time, hazards=state.hazards)
-        return ImplicitEuler().context(articulation, last, dt, gravity, control)
+        """T̂ = 2T_n − T_{n−1} + Δt² [0 | g]."""
+        now = place(articulation, state.q)
+        square = dt * dt
+        return StepContext(
+            dt=dt,
+            previous=now,
+            weight=1 / square,
+            target_poses=fallen(2 * now.poses - state.history[0], square[..., None, None] * gravity[..., None, :]),
+            target_q=retract(articulation, state.q, state.moves[0]),
+            control=control,
+            time=state.time,
+            gravity=gravity,
+        )
 
-    def advance(self, objective: BalanceObjective, state: FourPositions, q: Tensor) -> tuple[FourPositions, None]:
+    def advance(self, objective: BalanceObjective, state: FourPoses, q: Tensor) -> tuple[FourPoses, None]:
         """With a past of constant velocity."""
-        moved = difference(objective.articulation, state.q, q)
-        one = torch.ones_like(moved[..., 0])
-        past = _past(objective.articulation, q, moved, torch.zeros_like(moved), one)
-        return FourPositions(**after(objective, q), history=past, push=objective.push(q)), None
+        end, _ = super().advance(objective, state, q)
+        now, last = place(objective.articulation, q).poses, end.history[0]
+        still = torch.zeros_like(now[..., :3, :])
+        past = _before(now, (now - last)[..., :3, :], still, torch.ones_like(state.time))
+        return replaced(end, history=past, moves=(end.moves[0],) * 3), None
 
 
-def _past(articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, dt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """θ_{−1}, θ_{−2}, θ_{−3} of a motion at constant acceleration."""
+def _before(poses: Tensor, rates: Tensor, accelerations: Tensor, dt: Tensor) -> Past:
+    """T_{−1}, T_{−2}, T_{−3} of poses `[*batch, nlink, 4, 4]` with constant accelerations `[*batch, nlink, 3, 4]`."""
+    h = dt[..., None, None, None]
+
+    def at(k: int) -> Tensor:
+        moved = 0.5 * (k * h) ** 2 * accelerations - k * h * rates
+        return poses + torch.cat((moved, torch.zeros_like(moved[..., :1, :])), -2)
+
+    return at(1), at(2), at(3)
+
+
+def _moved(v: Tensor, acceleration: Tensor, dt: Tensor) -> Past:
+    """The last three displacements of a motion at constant acceleration, each `[*batch, nv]`."""
     h = dt[..., None]
-    first, second, third = (retract(articulation, q, 0.5 * (k * h) ** 2 * acceleration - k * h * v) for k in (1, 2, 3))
-    return first, second, third
+
+    def back(k: int) -> Tensor:
+        return h * (v - (k - 0.5) * h * acceleration)
+
+    return back(1), back(2), back(3)
 
 
-def _moves(articulation: Articulation, state: FourPositions) -> list[Tensor]:
-    """The last three displacements, the latest first, each `[*batch, nv]`."""
-    return [difference(articulation, before, now) for now, before in pairwise((state.q, *state.history))]
+def _steps(now: Tensor, state: FourPoses) -> list[Tensor]:
+    """The last three differences of the poses, the latest first, each `[*batch, nlink, 4, 4]`."""
+    return [last - before for last, before in pairwise((now, *state.history))]
 
 
 def _extrapolated(last: Tensor, before: Tensor, oldest: Tensor) -> Tensor:
