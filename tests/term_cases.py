@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -33,6 +34,7 @@ from pbfd_torch.terms.static_friction import StaticFriction
 from tests.random_trees import generator, moved_q, random_q, random_tree
 from tests.states import state_of
 
+QUICK = 50.0  # [m/s] at which contacts let go where bodies are thrown about at random
 NORMAL = (0.3, -0.5, 1.1)  # of the ground; scaled to unit length by HalfSpace
 
 
@@ -105,11 +107,16 @@ def colliders_of(articulation: Articulation, shapes: Sequence[Shape], margin: fl
 
 
 def contact(
-    s: Situation, friction: FrictionLaw | None, exponent: float = 2.0, shapes: Sequence[Shape] = (Point(),), margin: float = 0.0
+    s: Situation,
+    friction: FrictionLaw | None,
+    exponent: float = 2.0,
+    shapes: Sequence[Shape] = (Point(),),
+    margin: float = 0.0,
+    release: float = math.inf,
 ) -> Contact:
     """Contact with a tilted plane that about half of the candidates have pierced, none being closer to it than necessary."""
     colliders = colliders_of(s.articulation, shapes, margin)
-    made = Contact.between(s.articulation, colliders, HalfSpace(normal=NORMAL), NormalForce(1e4, exponent), friction)
+    made = Contact.between(s.articulation, colliders, HalfSpace(normal=NORMAL), NormalForce(1e4, exponent, release), friction)
     depth = made.depth(place(s.articulation, s.q))
     ordered = depth.sort(-1).values
     quarter = depth.shape[-1] // 4
@@ -179,6 +186,9 @@ CONTACTS = (
     TermCase("contact, α = 2.5", lambda s: contact(s, None, 2.5), "potential"),
     TermCase("contact, round", lambda s: contact(s, None, shapes=ROUND), "potential"),
     TermCase("contact, point with margin", lambda s: contact(s, None, margin=0.07), "potential"),
+    TermCase("contact, letting go", lambda s: contact(s, None, release=QUICK), "energy"),
+    TermCase("contact, α = 3, round, letting go", lambda s: contact(s, None, 3.0, ROUND, release=QUICK), "energy"),
+    TermCase("Coulomb, sliding, letting go", lambda s: contact(s, SLIDING, release=QUICK)),
     TermCase("Coulomb, sticking", lambda s: contact(s, STICKING)),
     TermCase("Coulomb, sliding", lambda s: contact(s, SLIDING)),
     TermCase("Coulomb, sticking, α = 2.5", lambda s: contact(s, STICKING, 2.5)),

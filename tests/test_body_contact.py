@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -21,7 +22,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import generator, moved_q
 from tests.states import state_of
-from tests.term_cases import Situation
+from tests.term_cases import QUICK, Situation
 
 STICKING = CoulombFriction(1.0, slip_speed=50.0)
 SLIDING = CoulombFriction(1.0, slip_speed=1e-4)
@@ -62,19 +63,23 @@ def two_arms(shapes: tuple[Shape, Shape], batch: tuple[int, ...]) -> tuple[Situa
     return s, [Collider("one", "arm", shapes[0]), Collider("other", "free", shapes[1], (0.01, 0.0, -0.02), (0.9, 0.1, 0.3, 0.2))]
 
 
-def contacts(s: Situation, colliders: list[Collider], friction: FrictionLaw | None) -> BodyContact:
-    rules = ContactRules(NormalForce(1e4), friction)
+def contacts(s: Situation, colliders: list[Collider], friction: FrictionLaw | None, release: float = math.inf) -> BodyContact:
+    rules = ContactRules(NormalForce(1e4, release=release), friction)
     (term,) = contact_terms(s.articulation, colliders, (), rules)
     assert isinstance(term, BodyContact)
     return dataclasses.replace(term, grip=0.7 * torch.ones_like(term.grip), slack=1.0)
 
 
-@pytest.mark.parametrize("friction", [None, STICKING, SLIDING], ids=["smooth", "sticking", "sliding"])
+@pytest.mark.parametrize(
+    ("friction", "release"),
+    [(None, math.inf), (STICKING, math.inf), (SLIDING, math.inf), (SLIDING, QUICK)],
+    ids=["smooth", "sticking", "sliding", "letting go"],
+)
 @pytest.mark.parametrize("kind", SHAPES)
-def test_jacobian_is_exact(kind: str, friction: FrictionLaw | None) -> None:
+def test_jacobian_is_exact(kind: str, friction: FrictionLaw | None, release: float) -> None:
     """J of both bodies and their coupling against central differences of r, in worlds that touch."""
     s, colliders = two_arms(SHAPES[kind], (4,))
-    term = contacts(s, colliders, friction)
+    term = contacts(s, colliders, friction, release)
     prepared = term.prepare(s.context(s.q))
     depth = term.force(prepared, place(s.articulation, s.q)).at.depth
     assert bool((depth > 1e-3).any(-1).all())
@@ -103,7 +108,7 @@ def test_obstacle_as_a_body() -> None:
     s, colliders = two_arms((Box((0.2, 0.3, 0.15)), Box((0.25, 0.2, 0.2))), (3,))
     arm = place(s.articulation, s.q).poses[..., 1, :, :]
     wall = Obstacle("wall", Box((0.25, 0.2, 0.2)), arm[..., :3, 3] + 0.2)
-    (term,) = contact_terms(s.articulation, colliders[:1], (wall,), ContactRules(NormalForce(1e4), SLIDING))
+    (term,) = contact_terms(s.articulation, colliders[:1], (wall,), ContactRules(NormalForce(1e4, release=math.inf), SLIDING))
     expected = jacobian(s.articulation, lambda q: s.balance([term], q).residual, s.q)
     balance = s.balance([term], s.q)
     assert float(balance.residual.abs().max()) > 1

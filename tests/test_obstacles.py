@@ -29,7 +29,7 @@ from pbfd_torch.worlds import Worlds
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import generator
 from tests.states import state_of
-from tests.term_cases import ROUND, SLIDING, STICKING, Situation, colliders_of, no_load, situation
+from tests.term_cases import QUICK, ROUND, SLIDING, STICKING, Situation, colliders_of, no_load, situation
 from tests.test_terms import contact_points, moved_scene, one_body, pose
 
 TIME = 0.7  # at the start of the step: a moving solid is not where it was put
@@ -86,8 +86,9 @@ class Meeting:
 
 
 def meeting(
-    seed: int, batch: tuple[int, ...], solid: str, motion: str, candidates: str, law: FrictionLaw | None, turn: float = 0.1
-) -> Meeting:
+    seed: int, batch: tuple[int, ...], solid: str, motion: str, candidates: str, law: FrictionLaw | None, turn: float = 0.1,
+    release: float = math.inf,
+) -> Meeting:  # fmt: skip
     """Of many random places of the obstacle, each world gets one at which a quarter to three quarters of the candidates touch and
     none is near the border of touching."""
     s, random = situation(seed, batch, turn), generator(50 + seed)
@@ -103,13 +104,13 @@ def meeting(
     )
     placement = place(s.articulation, s.q)
     end = torch.tensor(TIME, dtype=torch.float64) + s.dt
-    depth = Contact.between(s.articulation, colliders, trial, NormalForce(1e4), law).depth(placement, end)
+    depth = Contact.between(s.articulation, colliders, trial, NormalForce(1e4, release=release), law).depth(placement, end)
     share = (depth > 0).double().mean(-1)
     clear = torch.where((share - 0.5).abs() <= 0.25, depth.abs().amin(-1), 0.0)
     assert isinstance(trial.position, Tensor)
     at = trial.position.gather(0, clear.argmax(0)[None, ..., None].expand(1, *batch, 3))[0]
     obstacle = dataclasses.replace(trial, position=at)
-    made = Contact.between(s.articulation, colliders, obstacle, NormalForce(1e4), law)
+    made = Contact.between(s.articulation, colliders, obstacle, NormalForce(1e4, release=release), law)
     memory = 0.05 * torch.randn(made.memory(batch).shape, dtype=torch.float64, generator=random)
     return Meeting(s, obstacle, made, memory)
 
@@ -150,6 +151,12 @@ def test_jacobian_is_exact(solid: str, candidates: str, law: str) -> None:
 def test_jacobian_is_exact_beside_moving_solids(solid: str, motion: str, seed: int) -> None:
     """As above on other trees for every motion, with links that turn by about a third of a radian over the step."""
     assert jacobian_error(meeting(seed, (2,), solid, motion, "round", STICKING, turn=0.3)) <= 1e-7
+
+
+@all_solids
+def test_jacobian_is_exact_where_contacts_let_go(solid: str) -> None:
+    """As above with contacts that let go over the range of speeds of a random motion."""
+    assert jacobian_error(meeting(0, (2,), solid, "turntable", "round", SLIDING, release=QUICK)) <= 1e-7
 
 
 @all_solids

@@ -524,11 +524,16 @@ def test_contact_forces_carry_the_weight() -> None:
 
 
 def test_friction_cone_and_complementarity() -> None:
-    """Every recorded contact force has f·n = N = C⊥ d² for d > 0 and 0 for d ≤ 0, and ‖f∥‖ ≤ μ N; it never pulls."""
+    """Every recorded contact force has f·n = N ≤ C⊥ d² for d > 0, equal where the candidate sinks, and 0 for d ≤ 0, and
+    ‖f∥‖ ≤ μ N; it never pulls."""
     rollout = run(chain_slope_drop(), 0.02, 0.8)
     force, depth = rollout.contact_force, rollout.contact_depth
-    normal = 5e7 * depth.clamp_min(0) ** 2
-    torch.testing.assert_close(force[..., 2], normal, rtol=1e-9, atol=1e-9)
+    normal, most = force[..., 2], 5e7 * depth.clamp_min(0) ** 2
+    assert bool((normal <= most * (1 + 1e-9) + 1e-9).all())
+    assert float(normal.amin()) >= 0
+    sinks = depth[1:] >= depth[:-1]
+    assert int((sinks & (depth[1:] > 0)).sum()) > 100
+    torch.testing.assert_close(normal[1:][sinks], most[1:][sinks], rtol=1e-9, atol=1e-9)
     tangential = torch.linalg.vector_norm(force[..., :2], dim=-1)
     assert bool((tangential <= 0.3 * normal * (1 + 1e-12)).all())
     sliding = torch.isclose(tangential, 0.3 * normal, rtol=1e-9, atol=0) & (depth > 0)

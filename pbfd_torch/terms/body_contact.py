@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -50,7 +51,8 @@ class PreparedBodyContact:
     start: Tensor  # [*batch, n, 3] where the points were in the frames of the solids
     turned: Tensor  # [*batch, n, 3, 3] how their bodies stood in the frames of the solids
     anchor: Tensor | None  # [*batch, n, 3] what the anchors are behind by in the frames of the solids
-    bounce: Tensor | None = None  # [*batch, n] how far the surfaces are moved out to throw a point back
+    bounce: Tensor | None  # [*batch, n] how far the surfaces are moved out to throw a point back
+    depth: Tensor | None  # [*batch, n] of the points at the start, where the normal force lets go
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +124,13 @@ class BodyContact:
         start = start + step.dt[..., None, None] * self._running(slots, turn @ first[..., :3])
         anchor = _inherited(memory, slots) if isinstance(self.friction, AnchoredFriction) else None
         dt = step.dt[..., None]
-        bounce = None
+        gap, bounce = _gaps(slots, bodies), None
         if self.restitution is not None:
             coasting = torch.cat((step.coasting_poses, obstacles), -3)
-            bounce = self.restitution.bounce(_gaps(slots, bodies), _gaps(slots, ahead), dt, _gaps(slots, coasting))
+            bounce = self.restitution.bounce(gap, _gaps(slots, ahead), dt, _gaps(slots, coasting))
+        depth = -gap if math.isfinite(self.normal_force.release) else None
         grip = self.grip[slots.pair]
-        return PreparedBodyContact(dt, slots, grip, bodies, reach, obstacles, start, turn @ first[..., :3], anchor, bounce)
+        return PreparedBodyContact(dt, slots, grip, bodies, reach, obstacles, start, turn @ first[..., :3], anchor, bounce, depth)
 
     def _running(self, slots: Slots, turned: Tensor) -> Tensor:
         """Velocity of belts at the slots as their solids see it, `[*batch, n, 3]`: the solids' less the points'."""
@@ -210,7 +213,7 @@ class BodyContact:
         law = self.normal_force
         if self.restitution is not None and prepared.bounce is not None:
             law = self.restitution.stiffened(law, prepared.bounce)
-        return ContactForce(at, law, self.friction, prepared.dt, prepared.grip)
+        return ContactForce(at, law.during(prepared.depth, prepared.dt), self.friction, prepared.dt, prepared.grip)
 
     def load(self, prepared: PreparedBodyContact, placement: Placement) -> LinkLoad:
         slots, contact = prepared.slots, self.force(prepared, placement)

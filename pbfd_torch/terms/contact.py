@@ -46,7 +46,8 @@ class PreparedContact:
     frame: Tensor | None  # [*batch, 1, 3, 4] the solid's at the end of the step; None: the world's
     anchor: Tensor | None  # [*batch, npoint, 3] what the anchors are behind by, in world axes at the end of the step
     surface: Surface  # the solid, or what stands for it in this step
-    bounce: Tensor | None  # [*batch, npoint] how far the surface is moved out to throw a candidate back
+    bounce: Tensor | None = None  # [*batch, npoint] how far the surface is moved out to throw a candidate back
+    start: Tensor | None = None  # [*batch, npoint] how deep the candidates were, where the normal force lets go
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,19 +196,20 @@ class Contact:
         anchor = None
         if isinstance(self.friction, AnchoredFriction):
             anchor = memory if frame is None else turned(frame[..., :3], memory)
-        prepared = PreparedContact(dt, centers, rotations, frame, anchor, self.surface, None)
-        if self.restitution is None and math.isinf(self.thickness):
-            return prepared
-        free = self._grouping.mapped(step.target_poses, self.position)
+        prepared = PreparedContact(dt, centers, rotations, frame, anchor, self.surface)
+        free = functools.partial(self._grouping.mapped, step.target_poses, self.position)
         if math.isfinite(self.thickness):
-            moves = torch.linalg.vector_norm(free - centers, dim=-1)
+            moves = torch.linalg.vector_norm(free() - centers, dim=-1)
             tangent = Tangent.before(self.surface, _seen(frame, centers), moves, self.thickness)
             prepared = dataclasses.replace(prepared, surface=tangent)
-        if self.restitution is None:
+        if self.restitution is None and math.isinf(self.normal_force.release):
             return prepared
-        coasting = self._grouping.mapped(step.coasting_poses, self.position)
-        gaps = [-self._at(prepared, points, None).depth for points in (centers, free, coasting)]
-        return dataclasses.replace(prepared, bounce=self.restitution.bounce(gaps[0], gaps[1], dt, gaps[2]))
+        start, bounce = self._at(prepared, centers, None).depth, None
+        if self.restitution is not None:
+            coasting = self._grouping.mapped(step.coasting_poses, self.position)
+            gaps = [-self._at(prepared, points, None).depth for points in (free(), coasting)]
+            bounce = self.restitution.bounce(-start, gaps[0], dt, gaps[1])
+        return dataclasses.replace(prepared, bounce=bounce, start=start if math.isfinite(self.normal_force.release) else None)
 
     def remembered(self, prepared: PreparedContact, placement: Placement) -> Tensor:
         """What the anchors are behind by after a step that ended at a placement; shapes as in `memory`."""
@@ -255,7 +257,8 @@ class Contact:
         law = self.normal_force
         if self.restitution is not None and prepared.bounce is not None:
             law = self.restitution.stiffened(law, prepared.bounce)
-        return ContactForce(self.touching(prepared, placement), law, self.friction, prepared.dt, self.grip)
+        during = law.during(prepared.start, prepared.dt)
+        return ContactForce(self.touching(prepared, placement), during, self.friction, prepared.dt, self.grip)
 
     def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         contact = self.force(prepared, placement)
@@ -295,7 +298,7 @@ class Contact:
         if self.carrier is not None:
             frame = self.carrier.pose(centers.new_zeros(()) if time is None else time)[..., None, :3, :]
         none = centers.new_zeros(())
-        return self._at(PreparedContact(none, none, none, frame, None, self.surface, None), centers, None).depth
+        return self._at(PreparedContact(none, none, none, frame, None, self.surface), centers, None).depth
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
 from pbfd_torch.terms.checks import require_positive
+from pbfd_torch.terms.release import NormalLaw, Releasing
 from pbfd_torch.worlds import Worlds, replaced
 
 
@@ -35,15 +36,20 @@ class NormalForce:
     """f⊥ = C⊥ d^α n (Eq. 8), energy C⊥ d^{α+1}/(α+1) (Eq. 9); at rest d = (N/C⊥)^{1/α}.
 
     `stiffness`: C⊥ [N/m^α] > 0, one number, one per world `[*batch, 1]` or one per candidate `[*batch, npoint]`.
-    `exponent`: α > 1, so that the residual is continuously differentiable (what GE needs)."""
+    `exponent`: α > 1, so that the residual is continuously differentiable (what GE needs).
+    `release`: speed > 0 of leaving [m/s] at which a contact pushes no more, so that impacts are inelastic at any Δt (`Releasing`);
+    infinite: never, as in the paper, and short steps bounce."""
 
     stiffness: float | Tensor
     exponent: float = 2.0
+    release: float = 0.1
 
     def __post_init__(self) -> None:
         require_positive("stiffness", self.stiffness, "N/m^α")
         if not (math.isfinite(self.exponent) and self.exponent > 1):
             raise InputError(f"exponent α is {self.exponent}: must be > 1 and finite, or the residual is not smooth")
+        if not self.release > 0:
+            raise InputError(f"release is {self.release} m/s: must be > 0, or infinite for a contact that gives back what it takes")
 
     @staticmethod
     def for_weight(weight: float | Tensor, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:
@@ -58,7 +64,11 @@ class NormalForce:
 
     def scaled(self, factor: float) -> NormalForce:
         """The same law with C⊥ scaled by `factor` > 0."""
-        return NormalForce(self.stiffness * factor, self.exponent)
+        return replaced(self, stiffness=self.stiffness * factor)
+
+    def during(self, start: Tensor | None, dt: Tensor) -> NormalLaw:
+        """The law of a step of dt `[*batch, 1]` [s] that begins at depths `start` `[*batch, npoint]` [m]; None: not known."""
+        return self if start is None else Releasing(self, start, self.release * dt)
 
     def force(self, depth: Tensor) -> tuple[Tensor, Tensor]:
         """N and dN/dd `[*batch, npoint]` at depth d (≤ 0: apart, no force)."""

@@ -73,7 +73,7 @@ class TorsionalFriction:
     def _at(self, prepared: PreparedContact, placement: Placement) -> tuple[Touching, Tensor, Tensor, Tensor, Tensor]:
         """The candidates, φ, ℓμN and its slope by the depth, and y: each of the last three `[*batch, npoint]`."""
         force = self.contact.force(prepared, placement)
-        push, slope = force.normal_force.force(force.at.depth)
+        push, slope = force.push, force.normal_force.slope(force.at.depth)
         if self.held is not None:
             push, slope = self.held, torch.zeros_like(slope)
         turn = force.at.turn
@@ -118,7 +118,7 @@ class TorsionalFriction:
     def lagged(self, prepared: PreparedContact, placement: Placement) -> Self:
         """The same friction held at the normal forces of `placement`."""
         force = self.contact.force(prepared, placement)
-        return replaced(self, held=force.normal_force.force(force.at.depth)[0])
+        return replaced(self, held=force.push)
 
     def softened(self, factor: float) -> Self:
         """The same friction of a contact `factor` times as stiff."""

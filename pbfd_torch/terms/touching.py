@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pbfd_torch.rotations import log_jacobian_left, skew
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
-from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.release import NormalLaw
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class ContactForce:
     law is multiplied by, `[*, n]`: the μ of every candidate for a law whose own is 1."""
 
     at: Touching
-    normal_force: NormalForce
+    normal_force: NormalLaw
     friction: FrictionLaw | None
     dt: Tensor
     grip: Tensor | None = None
