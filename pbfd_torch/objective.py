@@ -163,15 +163,15 @@ class BalanceObjective:
                 hazards = hazards | term.hazards(prepared, placement)
         return Aftermath(tuple(memory), hazards)
 
-    def forces(self, q: Tensor) -> Tensor:
-        """Everything but inertia at the end of a step, `[*batch, nv]`."""
+    def forces(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Everything but inertia at the end of a step: what contacts and limits do, and the rest, each `[*batch, nv]`."""
         placement = place(self.articulation, q)
-        loads = [
-            term.load(prepared, placement)
-            for term, prepared in zip(self.terms, self.prepared, strict=True)
-            if not isinstance(term, Inertia | Armature)
-        ]
-        return -Balance(placement, loads).residual
+        abrupt: list[Load] = []
+        others: list[Load] = []
+        for term, load in zip(self.terms, self.loads(placement), strict=True):
+            if not isinstance(term, Inertia | Armature):
+                (abrupt if isinstance(term, Pushing) else others).append(load)
+        return -Balance(placement, abrupt).residual, -Balance(placement, others).residual
 
     def push(self, q: Tensor) -> Tensor:
         """How hard contacts and limits push in all at the end of a step, in weights of the articulation, `[*batch]`."""

@@ -20,7 +20,7 @@ from pbfd_torch.dynamics import bias_force, kinetic_energy, mass_matrix, potenti
 from pbfd_torch.errors import ContactOverflowError, InputError, ModelError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.integrators.integrator import Integrator, S, Trial
+from pbfd_torch.integrators.integrator import Integrator, S, Trial, calm
 from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.recording import Recorder
@@ -193,10 +193,16 @@ class Simulator(Generic[S]):
         simulator = Simulator(self.scene, self.dt, scheme, self.solver, self.halvings)
         start = scheme.at_rate(a, q, v, torch.zeros_like(v), self.step_size)
         end, solution = simulator.step(start, control)
-        force = simulator.objective(start, control).forces(end.q) - bias_force(a, q, v, self.scene.gravity)
-        acceleration, _ = torch.linalg.solve_ex(mass_matrix(a, q, self.scene.terms), force[..., None])
+        objective = simulator.objective(start, control)
+        abrupt, others = objective.forces(end.q)
+        others = others - bias_force(a, q, v, self.scene.gravity)
+        columns, _ = torch.linalg.solve_ex(mass_matrix(a, q, self.scene.terms), torch.stack((abrupt, others), -1))
+        by_abrupt, by_others = columns.unbind(-1)
+        # an impact within the step has given nothing before it
+        steady = calm(objective, objective.step.previous, self.step_size[..., None] * by_abrupt)
+        acceleration = by_others + torch.where(steady[..., None], by_abrupt, 0.0)
         solved = solution.solved
-        return Trial(end.q, torch.where(solved[..., None], acceleration.squeeze(-1), 0.0), solved)
+        return Trial(end.q, torch.where(solved[..., None], acceleration, 0.0), solved)
 
     def objective(self, state: S, control: Tensor | None = None) -> BalanceObjective:
         """The balance of forces that the step from `state` solves."""

@@ -215,7 +215,8 @@ CONTACTS = (
 TERMS = (
     TermCase("inertia", lambda s: Inertia(), "energy"),
     *CONTACTS,
-    TermCase("joint limits", lambda s: JointLimits(coefficients(s, 50.0)), "potential"),
+    TermCase("joint limits", lambda s: JointLimits(coefficients(s, 50.0), math.inf), "potential"),
+    TermCase("joint limits, letting go", lambda s: JointLimits(coefficients(s, 50.0), QUICK), "energy"),
     TermCase("joint damping", lambda s: JointDamping(coefficients(s, 1.0)), "energy"),
     TermCase("armature", lambda s: Armature(coefficients(s, 0.1)), "energy"),
     TermCase("joint springs", lambda s: JointSprings(coefficients(s, 20.0), random_q(s.articulation, 17)), "potential"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -34,7 +35,7 @@ def everything(s: Situation, friction: CoulombFriction) -> list[Term]:
         Inertia(),
         contact(s, friction),
         contact(s, friction, 2.5, ROUND),
-        JointLimits(coefficients(s, 50.0)),
+        JointLimits(coefficients(s, 50.0), math.inf),
         JointDamping(coefficients(s, 1.0)),
         Armature(coefficients(s, 0.1)),
         JointSprings(coefficients(s, 20.0), random_q(s.articulation, 17)),
@@ -71,7 +72,7 @@ def test_conservative_part_is_gradient_and_hessian_of_a_sum_over_points(seed: in
     bodies = dataclasses.replace(bodies, articulation=a)
     s = dataclasses.replace(base, articulation=a)
     t = a.topology
-    made, limits = contact(s, None, exponent), JointLimits(coefficients(s, 50.0))
+    made, limits = contact(s, None, exponent), JointLimits(coefficients(s, 50.0), math.inf)
     scalar = torch.zeros(a.nv, dtype=torch.float64)
     scalar[t.scalar_v] = 20.0
     springs = JointSprings(scalar, a.rest)

@@ -4,7 +4,6 @@ the table say."""
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -26,18 +25,7 @@ EXPECTED = {
 }
 
 
-# what does not hold yet, and why; a case that comes to hold fails here
-EDGE = "the trial step creeps from rest: its acceleration, taken for the past, is a speed that nothing slows at the cone itself"
-BROKEN = {("critical-slope", "bdf2"): EDGE}
-
-
-def marked(case: Case, run: Run) -> Any:
-    reason = BROKEN.get((case.name, run.integrator))
-    marks = [pytest.mark.xfail(reason=reason, strict=True)] if reason else []
-    return pytest.param(case, run, marks=marks, id=f"{case.name}-{run.integrator}-{run.dt:g}")
-
-
-@pytest.mark.parametrize(("case", "run"), [marked(case, run) for case, run in QUICK])
+@pytest.mark.parametrize(("case", "run"), QUICK, ids=[f"{case.name}-{run.integrator}-{run.dt:g}" for case, run in QUICK])
 def test_what_must_hold(case: Case, run: Run) -> None:
     """The case's law: see its docstring."""
     result = measure(case, run)

@@ -18,6 +18,7 @@ from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.simulator import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.finite_differences import derivative, relative_error
 
@@ -80,5 +81,6 @@ def test_short_steps_do_not_bounce(integrator: Integrator) -> None:
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
 def test_bad_speed(speed: float) -> None:
-    with pytest.raises(InputError, match=r"release is .* must be > 0"):
-        NormalForce(1.0, release=speed)
+    for law in (lambda: NormalForce(1.0, release=speed), lambda: JointLimits(torch.ones(1, dtype=torch.float64), speed)):
+        with pytest.raises(InputError, match=r"release is .* must be a speed > 0"):
+            law()

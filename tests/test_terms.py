@@ -179,7 +179,7 @@ def test_no_load_inside_the_limits() -> None:
     inf = torch.full_like(s.articulation.lower, math.inf)
     free = dataclasses.replace(s.articulation, lower=-inf, upper=inf)
     limits = JointLimits(torch.full((free.nv,), 50.0, dtype=torch.float64))
-    load = limits.load(None, place(free, s.q))
+    load = limits.load(limits.prepare(dataclasses.replace(s, articulation=free).context(s.q)), place(free, s.q))
     assert bool((load.residual == 0).all())
     assert bool((load.stiffness == 0).all())
     assert bool((limits.potential(place(free, s.q), s.state.time) == 0).all())
@@ -506,7 +506,8 @@ def test_joint_limit_torque() -> None:
     s = situation(0)
     a = s.articulation
     k = torch.full((a.nv,), 40.0, dtype=torch.float64)
-    residual = JointLimits(k).load(None, place(a, s.q)).residual
+    limits = JointLimits(k, math.inf)
+    residual = limits.load(limits.prepare(s.context(s.q)), place(a, s.q)).residual
     x = s.q[a.topology.scalar_q]
     lower, upper = a.lower[a.topology.scalar_v], a.upper[a.topology.scalar_v]
     expected = 40.0 * ((x - upper).clamp_min(0) ** 2 - (lower - x).clamp_min(0) ** 2)

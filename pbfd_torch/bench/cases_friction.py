@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pbfd_torch.bench.hard_cases_case import ALL, CONSERVING, MEAN_VELOCITY, TIME_STEPS, Case, Check, Run, most
+from pbfd_torch.bench.hard_cases_case import ALL, CONSERVING, MEAN_VELOCITY, ONE_STEP, TIME_STEPS, Case, Check, Run, most
 from pbfd_torch.bench.hard_cases_scenes import (
     GRAVITY,
     SLIP_SPEED,
@@ -46,7 +46,7 @@ def stopping_distance(run: Run) -> Sequence[Check]:
     limit = 0.005 if run.dt <= 0.02 else 0.01
     return (
         Check("distance error, ≥ 4 steps", most(error[slow]), limit, run.among(ALL, 0.05)),
-        Check("speed at the end [m/s]", most(rollout.v[-1]), 1e-3),
+        Check("speed at the end [m/s]", most(rollout.v[-1]), 1e-3, run.among(ONE_STEP) or run.among(ALL, 0.05)),
         run.solved(),
     )
 
@@ -72,7 +72,8 @@ def ramp_grid(run: Run) -> Sequence[Check]:
 
 
 def critical_slope(run: Run) -> Sequence[Check]:
-    """tan = .5, 25 s: with μ = .49 a box slides ½ g (sin − μ cos) T², to 1 %; with μ = .5, the cone itself, no faster than ε_v."""
+    """tan = .5, 25 s: with μ = .49 a box slides ½ g (sin − μ cos) T², to 1 %; with μ = .5, the cone itself, no faster than ε_v
+    (BDF2, which keeps the speed it starts with: reported)."""
     mu = row(0.49, 0.5)
     slope = torch.atan(row(0.5, 0.5))
     scene, q = box_on_slope(coulomb(mu), slope)
@@ -82,7 +83,7 @@ def critical_slope(run: Run) -> Sequence[Check]:
     exact = 0.5 * float(slide(slope, mu)[0]) * duration**2
     return (
         Check("slide error, μ .49", abs(float(moved[0]) / exact - 1), 0.01),
-        Check("speed, μ .5 [m/s]", abs(float(moved[1])) / duration, SLIP_SPEED),
+        Check("speed, μ .5 [m/s]", abs(float(moved[1])) / duration, SLIP_SPEED, run.among(ONE_STEP)),
         run.solved(),
     )
 

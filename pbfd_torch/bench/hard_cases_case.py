@@ -18,6 +18,7 @@ ALL = tuple(INTEGRATORS)
 FIRST_ORDER = ("implicit-euler",)
 SECOND_ORDER = tuple(name for name in ALL if name not in FIRST_ORDER)
 CONSERVING = ("variational", "energy-momentum")  # the angular momentum, exactly
+ONE_STEP = tuple(name for name in ALL if name != "bdf2")  # no memory of contact forces before the last step's
 MEAN_VELOCITY = ("implicit-euler", "variational")  # their velocity is the average over the last step
 BEST = ("energy-momentum",)
 TIME_STEPS = (1 / 1000, 1 / 250, 1 / 100, 1 / 50, 1 / 20, 1 / 10)  # [s]

@@ -52,7 +52,8 @@ class Trial:
 
     Attributes:
         end: where, `[*batch, nq]`.
-        acceleration: M⁻¹ (f − h) at the start, with the forces f of the end, `[*batch, nv]`; zero where it is unsolved.
+        acceleration: M⁻¹ (f − h) at the start, with the forces f of the end but for those of an impact, `[*batch, nv]`; zero where
+            it is unsolved.
         solved: `[*batch]`.
     """
 

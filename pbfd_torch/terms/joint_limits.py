@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Self
 
@@ -11,18 +12,33 @@ from pbfd_torch.articulation import Articulation, force_scale, lever
 from pbfd_torch.kinematics import Placement
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
+from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.release import NormalLaw, require_release
 from pbfd_torch.worlds import Worlds, replaced
+
+_LAW = NormalForce(1.0, exponent=2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLimits:
+    below: NormalLaw  # of how far each coordinate is below its lower limit
+    above: NormalLaw
 
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Torque −k x² back towards the range, x the violation of `articulation.lower/upper`; energy k x³/3. `stiffness` `[*, nv]`
-    [N m/rad² or N/m²] > 0: a load τ rests √(τ/k) past the limit. Coordinates of ball and free joints have no limits."""
+    """Torque −k x² back towards the range, x the violation of `articulation.lower/upper`; energy k x³/3. Like a contact, a limit
+    lets go of what leaves it (`Releasing`). Coordinates of ball and free joints have no limits.
+
+    `stiffness`: k `[*, nv]` [N m/rad² or N/m²] > 0: a load τ rests √(τ/k) past the limit.
+    `release`: speed > 0 of leaving [rad/s or m/s] at which a limit pushes no more; infinite: never, and short steps bounce."""
 
     stiffness: Tensor
+    release: float = 1.0
 
     def __post_init__(self) -> None:
         require_positive("limit stiffness", self.stiffness)
+        require_release(self.release)
 
     @staticmethod
     def for_articulation(articulation: Articulation, gravity: float = 9.81, violation: float = 2e-3) -> JointLimits:
@@ -31,40 +47,50 @@ class JointLimits:
         require_positive("violation", violation, "rad or m")
         return JointLimits(force_scale(articulation, gravity) / violation**2)
 
-    def prepare(self, step: StepContext) -> None:
-        return None
+    @property
+    def _law(self) -> NormalForce:
+        return replaced(_LAW, stiffness=self.stiffness, release=self.release)
 
-    def load(self, prepared: None, placement: Placement) -> JointLoad:
-        below, above = _violations(placement)
-        residual = self.stiffness * (above * above - below * below)
-        return diagonal_load(residual, 2 * self.stiffness * (above + below))
+    def prepare(self, step: StepContext) -> PreparedLimits:
+        if math.isinf(self.release):
+            return PreparedLimits(self._law, self._law)
+        starts, dt = _depths(step.previous), step.dt[..., None]
+        below, above = (self._law.during(depth.clamp_min(0), dt) for depth in starts)
+        return PreparedLimits(below, above)
 
-    def energy(self, prepared: None, placement: Placement) -> Tensor:
-        """The stored energy [J] `[*batch]`."""
-        below, above = _violations(placement)
-        return (self.stiffness * (above**3 + below**3)).sum(-1) / 3
+    def load(self, prepared: PreparedLimits, placement: Placement) -> JointLoad:
+        below, above = _depths(placement)
+        residual = prepared.above.push(above) - prepared.below.push(below)
+        return diagonal_load(residual, prepared.above.slope(above) + prepared.below.slope(below))
+
+    def energy(self, prepared: PreparedLimits, placement: Placement) -> Tensor:
+        """The integral of the step's forces [J] `[*batch]`."""
+        below, above = _depths(placement)
+        return (prepared.above.energy(above) + prepared.below.energy(below)).sum(-1)
 
     def take(self, worlds: Worlds) -> Self:
         """The same limits with the stiffness of some worlds."""
         return replaced(self, stiffness=worlds.pick(self.stiffness, 1))
 
-    def softened(self, factor: float) -> JointLimits:
+    def softened(self, factor: float) -> Self:
         """The same limits with stiffness scaled by `factor`."""
-        return JointLimits(self.stiffness * factor)
+        return replaced(self, stiffness=self.stiffness * factor)
 
-    def push(self, prepared: None, placement: Placement) -> Tensor:
+    def push(self, prepared: PreparedLimits, placement: Placement) -> Tensor:
         """See `Pushing`."""
         return (self.load(prepared, placement).residual.abs() / lever(placement.articulation)).sum(-1)
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""
-        return self.energy(None, placement)
+        below, above = _depths(placement)
+        return (self._law.energy(above) + self._law.energy(below)).sum(-1)
 
 
-def _violations(placement: Placement) -> tuple[Tensor, Tensor]:
-    """How far each coordinate is below its lower and above its upper limit, ≥ 0, `[*batch, nv]`."""
+def _depths(placement: Placement) -> tuple[Tensor, Tensor]:
+    """How far each coordinate is below its lower and above its upper limit, < 0 within the range, −1 at least, `[*batch, nv]`."""
     articulation = placement.articulation
     t = articulation.topology
     x = placement.q.new_zeros((*placement.q.shape[:-1], articulation.nv))
     x[..., t.scalar_v] = placement.q[..., t.scalar_q]
-    return (articulation.lower - x).clamp_min(0), (x - articulation.upper).clamp_min(0)
+    # what has no limit is infinitely far from it, which autograd does not survive
+    return (articulation.lower - x).clamp_min(-1.0), (x - articulation.upper).clamp_min(-1.0)

@@ -12,7 +12,7 @@ from torch import Tensor
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
 from pbfd_torch.terms.checks import require_positive
-from pbfd_torch.terms.release import NormalLaw, Releasing
+from pbfd_torch.terms.release import NormalLaw, Releasing, require_release
 from pbfd_torch.worlds import Worlds, replaced
 
 
@@ -48,8 +48,7 @@ class NormalForce:
         require_positive("stiffness", self.stiffness, "N/m^α")
         if not (math.isfinite(self.exponent) and self.exponent > 1):
             raise InputError(f"exponent α is {self.exponent}: must be > 1 and finite, or the residual is not smooth")
-        if not self.release > 0:
-            raise InputError(f"release is {self.release} m/s: must be > 0, or infinite for a contact that gives back what it takes")
+        require_release(self.release)
 
     @staticmethod
     def for_weight(weight: float | Tensor, penetration: float = 3e-4, exponent: float = 2.0) -> NormalForce:

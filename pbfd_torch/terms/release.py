@@ -12,9 +12,19 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pbfd_torch.errors import InputError
+
 # Gauss–Legendre nodes and weights on [0, 1]: exact for polynomials up to the ninth degree
 _NODES = (0.04691007703066800, 0.23076534494715845, 0.5, 0.76923465505284155, 0.95308992296933200)
 _WEIGHTS = (0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454)
+
+
+def require_release(speed: float) -> None:
+    """Raises `InputError` unless the speed is > 0; infinite: nothing is ever let go."""
+    if not speed > 0:
+        raise InputError(
+            f"release is {speed}: must be a speed > 0, or infinite for a contact or limit that gives back what it takes"
+        )
 
 
 class NormalLaw(Protocol):
