@@ -19,7 +19,7 @@ from pbfd_torch.dynamics import momentum
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models.setup import Metric, Setup, repeated, tilted
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia

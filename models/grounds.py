@@ -18,7 +18,7 @@ from pbfd_torch.contact.shapes import Box, Collider, Cylinder, Sphere
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.models.stacks import GRAVITY, solid_box
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 
 Metric = float | list[float]
 

@@ -9,7 +9,7 @@ import torch
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.inertia import Inertia
 
 

@@ -14,7 +14,7 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider, ConvexHull, Shape
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia

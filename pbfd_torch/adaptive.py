@@ -19,7 +19,8 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.kinematics import place
 from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.simulator import SHORTEST_STEP, Scene, Simulator, Solver, put
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import SHORTEST_STEP, Simulator, Solver, put
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.worlds import Worlds, replaced
 

@@ -125,16 +125,17 @@ class AsynchronousRollout:
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
         # for all lanes, although most are not at the end: those that are, are not worth a scene of their own
         integrator = self._simulator.integrator
-        advanced, refused = integrator.advance(self._objective, self._state, self._progress.q)
+        advanced, refusal = integrator.advance(self._objective, self._state, self._progress.q)
         advanced = mapped(lambda x: x[index], advanced)
-        refused = None if refused is None else refused[index]
+        refused = None if refusal is None else refusal()[index]
         if len(unsolved_worlds(found)) or (refused is not None and bool(refused.any())):
             simulator = self._simulator.take(lanes)
             if self._fallbacks is not None:
                 objective = self._objective.take(index)
                 found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
-                advanced, refused = integrator.advance(objective, state, found.q)
-            advanced, found = simulator.finished(state, held, advanced, found, refused)
+                advanced, refusal = integrator.advance(objective, state, found.q)
+                refused = None if refusal is None else refusal()
+            advanced, found, _ = simulator.finished(state, held, advanced, found, refused)
             self.lanes += found.lanes
         self._record(index, advanced, held, found)
         self._state = mapped(lambda old, new: old.index_copy(0, index, new), self._state, advanced)

@@ -28,3 +28,11 @@ class ContactOverflowError(PbfdError, RuntimeError):
 
 class NotModelledWarning(UserWarning):
     """Something that a file asks for and that the simulation leaves out; given once per file and feature."""
+
+
+class GradientError(PbfdError, RuntimeError):
+    """Derivatives were asked for of a step that has none: unsolved, or with a singular Jacobian."""
+
+
+class GradientWarning(UserWarning):
+    """Derivatives were given where there are none, as asked for."""

@@ -22,6 +22,7 @@ from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import (
     Aftermath,
+    Foreboding,
     Frictional,
     Hazardous,
     Load,
@@ -136,6 +137,10 @@ class BalanceObjective:
     def widened(self, factor: float) -> Self:
         """The same step with friction smooth over `factor` times as wide a range of slip."""
         return self._with([term.widened(factor) if isinstance(term, Frictional) else term for term in self.terms])
+
+    def seen_from(self, distance: float) -> Self:
+        """The same step with normal forces that set in `distance` [m] before anything touches."""
+        return self._with([term.seen_from(distance) if isinstance(term, Foreboding) else term for term in self.terms])
 
     def lagged(self, q: Tensor) -> EnergyObjective:
         """The step whose friction feels the normal forces at q whatever comes: its balance is the gradient of an energy."""

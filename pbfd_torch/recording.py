@@ -17,7 +17,7 @@ from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 
 if TYPE_CHECKING:
-    from pbfd_torch.simulator import Scene
+    from pbfd_torch.scene import Scene
 
 
 class Recorder:

@@ -16,7 +16,8 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
-from pbfd_torch.simulator import Scene, Simulator, Solver
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator, Solver
 
 
 def state_of(q: Tensor, q_previous: Tensor) -> Positions:

@@ -16,7 +16,8 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Collider, Cylinder
 from pbfd_torch.errors import InputError
 from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import Relaxable, Solution
 from pbfd_torch.terms.anchored_friction import AnchoredFriction

@@ -18,7 +18,8 @@ from pbfd_torch.integrators.fitted import Fittable, Fitted, fit, fitted
 from pbfd_torch.kinematics import Chord, local_twists, place, retract
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import skew
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia

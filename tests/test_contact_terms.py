@@ -21,7 +21,8 @@ from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylind
 from pbfd_torch.errors import ContactOverflowError, InputError
 from pbfd_torch.hazards import Hazard, Overflow
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
@@ -221,7 +222,8 @@ import sys
 import torch
 from pbfd_torch.contact.shapes import Box, Collider
 from pbfd_torch.models import SCENES
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact_terms import contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from tests.test_contact_terms import HULL, two_free

@@ -33,7 +33,7 @@ from pbfd_torch.models.robots import hopper
 from pbfd_torch.models.stacks import stack
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import skew
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact

@@ -22,7 +22,7 @@ from pbfd_torch.dynamics import (
 from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.rotations import quaternion_matrix
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia

@@ -12,7 +12,8 @@ from torch import Tensor
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import chain_slope_drop
 from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import STIFFNESSES, WIDTHS, Continuation, Fallbacks, WarmStart
 from pbfd_torch.solvers.objective import Relaxable, Solution, Status

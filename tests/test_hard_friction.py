@@ -17,7 +17,7 @@ from pbfd_torch.models.grounds import BELT, BELT_FRICTION, RADII, RAMP_FRICTION,
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms

@@ -22,7 +22,8 @@ from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.chains import chain_colliders, chain_fixed, chain_links
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import FALLBACKS, Status
 from pbfd_torch.solvers.per_world import mapped

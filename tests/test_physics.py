@@ -23,7 +23,7 @@ from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_matrix, rotation_log
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact

@@ -19,7 +19,8 @@ from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import STIFFNESS, chain_colliders, chain_ground, chain_links
 from pbfd_torch.models.setup import tilted
 from pbfd_torch.objective import BalanceObjective, EnergyObjective
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.terms.contact import Contact

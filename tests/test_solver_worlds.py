@@ -16,7 +16,8 @@ from pbfd_torch.kinematics import retract
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import chain_fixed, chain_ground
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Continuation, Fallbacks
 from pbfd_torch.solvers.named import jtj_lm, lbfgs, lm

@@ -15,7 +15,7 @@ from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import HALF, arch, heavy_on_light, stack, stack_10
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw

@@ -14,7 +14,7 @@ from pbfd_torch.contact.shapes import Collider, Point, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import place
 from pbfd_torch.objective import EnergyObjective
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia

@@ -18,7 +18,8 @@ from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylind
 from pbfd_torch.contact.surface import Tangent
 from pbfd_torch.hazards import Hazard
 from pbfd_torch.models.stacks import solid_box
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact_terms import contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from tests.bodies import rolled_out

@@ -14,7 +14,7 @@ from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.rotations import quaternion_exp
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia

@@ -27,7 +27,7 @@ from pbfd_torch.models.chains import chain_heavy as chain_heavy_setup
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia

@@ -15,7 +15,7 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.models.chains import chain_ground as chain_ground_setup
 from pbfd_torch.models.chains import chain_slope, chain_slope_drop
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce

@@ -30,7 +30,8 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.kinematics import place
 from pbfd_torch.models.spinning import dzhanibekov as dzhanibekov_setup
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.inertia import Inertia
 

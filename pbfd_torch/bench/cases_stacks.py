@@ -14,7 +14,7 @@ from pbfd_torch.contact.shapes import Collider, Sphere
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import heavy_on_light as heavy_on_light_setup
 from pbfd_torch.models.stacks import solid_box, stack, stack_10
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce

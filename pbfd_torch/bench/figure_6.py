@@ -23,7 +23,8 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models import chains
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.contact import Contact

@@ -11,7 +11,7 @@ from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potent
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models import Setup
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 
 

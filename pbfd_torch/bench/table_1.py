@@ -16,7 +16,8 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models.chains import GRAVITY, RADIUS, STIFFNESS, chain_colliders, chain_links
 from pbfd_torch.objective import BalanceObjective, EnergyObjective
-from pbfd_torch.simulator import Scene, Simulator
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.directions import Direction, GaussNewtonLm, JtjLm, Lm, Model, Newton, times
 from pbfd_torch.solvers.lbfgs import Lbfgs
 from pbfd_torch.solvers.objective import Objective

@@ -25,7 +25,7 @@ from pbfd_torch.dynamics import bias_force, mass_matrix
 from pbfd_torch.errors import InputError
 from pbfd_torch.kinematics import place, retract
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction

@@ -11,7 +11,7 @@ from torch import Tensor
 from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy, rotor_energy
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.rollout import Rollout
-from pbfd_torch.simulator import Scene
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.joint_limits import JointLimits

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, fresh
 from pbfd_torch.kinematics import Motion, difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.load import StepContext, Term
@@ -93,7 +93,7 @@ class Bdf2:
             gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: FourPoses, q: Tensor) -> tuple[FourPoses, Tensor | None]:
+    def advance(self, objective: BalanceObjective, state: FourPoses, q: Tensor) -> tuple[FourPoses, Refusal | None]:
         """See `Integrator`."""
         step, push = objective.step, objective.push(q)
         end = FourPoses(
@@ -102,7 +102,7 @@ class Bdf2:
             moves=(difference(objective.articulation, state.q, q), *state.moves[:2]),
             push=push,
         )
-        return end, (push - state.push).abs() > self.jump
+        return end, lambda: (push - state.push).abs() > self.jump
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
         """None: an easier step is good enough."""

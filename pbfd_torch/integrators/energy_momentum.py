@@ -26,7 +26,7 @@ from pbfd_torch.assembly import Balance
 from pbfd_torch.dynamics import armature_diagonal, generalised_momentum, kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, calm, fall, fresh
+from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, calm, fall, fresh
 from pbfd_torch.kinematics import Chord, Motion, Placement, difference, place, retract
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.inertia import Inertia
@@ -120,7 +120,7 @@ class EnergyMomentum:
             guess=retract(articulation, state.q, dt[..., None] * state.average),
         )
 
-    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> tuple[Velocities, Tensor | None]:
+    def advance(self, objective: BalanceObjective, state: Velocities, q: Tensor) -> tuple[Velocities, Refusal | None]:
         """See `Integrator`."""
         step, now = objective.step, place(objective.articulation, q)
         forces, dt = _Forces(objective, now), step.dt
@@ -129,10 +129,14 @@ class EnergyMomentum:
         early = dt[..., None] * (forces.rough + forces.ahead * forces.smooth)
         momentum = _momentum(objective, now, 2 * rates - before, 2 * average - state.v) - early
         end = _ended(objective, state, now, momentum, forces, average)
-        flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
-        turned = objective.turn(dt[..., None] * average)
-        gained, energy = self._gain(objective, state, end, now, forces)
-        return end, (flat < FLATTEST) | (turned > FARTHEST) | (gained > EXCESS * energy)
+
+        def refused() -> Tensor:
+            flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
+            turned = objective.turn(dt[..., None] * average)
+            gained, energy = self._gain(objective, state, end, now, forces)
+            return (flat < FLATTEST) | (turned > FARTHEST) | (gained > EXCESS * energy)
+
+        return end, refused
 
     def _gain(
         self, objective: BalanceObjective, state: Velocities, end: Velocities, now: Placement, forces: _Forces

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
@@ -44,6 +44,9 @@ class State:
 
 
 S = TypeVar("S", bound=State, default=Any)
+
+Refusal = Callable[[], Tensor]
+"""Says which worlds `[*batch]` may not go on from the end of a step, although it was solved, but must take an easier one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +114,8 @@ class Integrator(Protocol[S]):
         """What is fixed during the step from `state`."""
         ...
 
-    def advance(self, objective: BalanceObjective, state: S, q: Tensor) -> tuple[S, Tensor | None]:
-        """The state after the step of an objective that ended at q, and the worlds `[*batch]` that may not go on from there,
-        although it was solved, but must take an easier step; None: no world."""
+    def advance(self, objective: BalanceObjective, state: S, q: Tensor) -> tuple[S, Refusal | None]:
+        """The state after the step of an objective that ended at q, and who may not go on from there; None: no world."""
         ...
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:

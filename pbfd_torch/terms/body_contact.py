@@ -255,6 +255,10 @@ class BodyContact:
         """As `Contact.widened`."""
         return replaced(self, friction=widened_law(self.friction, factor))
 
+    def seen_from(self, distance: float) -> Self:
+        """See `Foreboding`."""
+        return replaced(self, normal_force=self.normal_force.seen_from(distance))
+
     def softened(self, factor: float) -> BodyContact:
         """As `Contact.softened`."""
         return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))

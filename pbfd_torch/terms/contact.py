@@ -324,6 +324,10 @@ class Contact:
         """The same contact with its friction smooth over a `factor` ≥ 1 times wider range of slip speeds, where the law has one."""
         return replaced(self, friction=widened_law(self.friction, factor))
 
+    def seen_from(self, distance: float) -> Self:
+        """See `Foreboding`."""
+        return replaced(self, normal_force=self.normal_force.seen_from(distance))
+
     def softened(self, factor: float) -> Contact:
         """The same contact with C⊥ scaled by `factor`; the friction law follows the normal force."""
         return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))

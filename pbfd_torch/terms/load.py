@@ -168,6 +168,15 @@ class OneSided(Protocol):
 
 
 @runtime_checkable
+class Foreboding(Protocol):
+    """A term with normal forces, for derivatives that are to know of contacts before they happen."""
+
+    def seen_from(self, distance: float) -> Term:
+        """The same term, whose normal forces set in softly at `distance` > 0 [m]; works with what the original prepared."""
+        ...
+
+
+@runtime_checkable
 class Pushing(Protocol):
     """A term that sets in abruptly when things meet."""
 

@@ -65,6 +65,10 @@ class NormalForce:
         """The same law with C⊥ scaled by `factor` > 0."""
         return replaced(self, stiffness=self.stiffness * factor)
 
+    def seen_from(self, distance: float) -> DistantForce:
+        """The same law as derivatives may see it, from `distance` > 0 [m] on."""
+        return DistantForce(self.stiffness, self.exponent, self.release, distance)
+
     def during(self, start: Tensor | None, dt: Tensor) -> NormalLaw:
         """The law of a step of dt `[*batch, 1]` [s] that begins at depths `start` `[*batch, npoint]` [m]; None: not known."""
         return self if start is None else Releasing(self, start, self.release * dt)
@@ -84,6 +88,33 @@ class NormalForce:
     def energy(self, depth: Tensor) -> Tensor:
         """C⊥ d^{α+1}/(α+1) [J] per candidate."""
         return self.stiffness * power(depth.clamp_min(0), self.exponent + 1) / (self.exponent + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class DistantForce(NormalForce):
+    """C⊥ (δ ln(1 + e^{d/δ}))^α: sets in before anything touches, about δ = `distance` [m] away. For derivatives only: it has no
+    energy in closed form."""
+
+    distance: float = 1e-3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("distance", self.distance, "m")
+
+    def _felt(self, depth: Tensor) -> Tensor:
+        return self.distance * torch.nn.functional.softplus(depth / self.distance)
+
+    def push(self, depth: Tensor) -> Tensor:
+        """See `NormalForce`."""
+        return super().push(self._felt(depth))
+
+    def slope(self, depth: Tensor) -> Tensor:
+        """See `NormalForce`."""
+        return super().slope(self._felt(depth)) * torch.sigmoid(depth / self.distance)
+
+    def energy(self, depth: Tensor) -> Tensor:
+        """There is none."""
+        raise NotImplementedError("a force that is seen from a distance is for derivatives, and has no energy")
 
 
 def default_stiffness(articulation: Articulation, penetration: float = 1e-3) -> NormalForce:

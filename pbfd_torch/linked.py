@@ -1,0 +1,311 @@
+"""Steps as nodes of the graph of derivatives: made without any first, and retraced with them when they are asked for.
+
+A node keeps the tensors that its step set out from, which the step before has made anyway, and how the step was made (`Way`): no
+graph, no Jacobian. So a rollout that carries derivatives is as large as its states.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+from torch.autograd.function import once_differentiable
+
+from pbfd_torch.errors import GradientError, GradientWarning
+from pbfd_torch.implicit import Doubt, Doubtful, Factors, blurred, followed
+from pbfd_torch.integrators.integrator import S
+from pbfd_torch.parameters import mapped_tensors, tensors_of
+from pbfd_torch.solvers.objective import Solution, Status
+from pbfd_torch.way import Way
+
+if TYPE_CHECKING:
+    from pbfd_torch.simulator import Simulator
+
+
+def carries(value: Tensor) -> bool:
+    """Whether a tensor carries derivatives, backward or forward ones."""
+    if torch.is_grad_enabled() and value.requires_grad:
+        return True
+    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
+
+
+@dataclass(eq=False)
+class Made:
+    """A step that carries derivatives.
+
+    Attributes:
+        solution: how it was solved; way: how it was made.
+        doubts: `[*batch]` int, bits of `Doubt`.
+        factors: those of J where they are kept.
+    """
+
+    solution: Solution
+    way: Way
+    doubts: Tensor
+    factors: Factors | None = None
+
+
+class Linked(Generic[S]):
+    """The steps of a simulator as functions that carry derivatives.
+
+    `active`: the positions, among all tensors of the simulator's parts, of those that carry any."""
+
+    def __init__(self, simulator: Simulator[S]) -> None:
+        self.simulator = simulator
+        self.parts = simulator.parts
+        self.leaves = tensors_of(self.parts)
+        self.active = [k for k, x in enumerate(self.leaves) if carries(x) or _wrapped(x)]
+        self._plain: Simulator[S] | None = None
+
+    def plain(self, values: Sequence[Tensor]) -> Simulator[S]:
+        """The simulator without derivatives, from plain values of the active tensors."""
+        if self._plain is None:
+            self._plain = self.with_values(values) if self.active else self.simulator
+        return self._plain
+
+    def with_values(self, values: Sequence[Tensor]) -> Simulator[S]:
+        """The simulator with other values of the active tensors."""
+        if not self.active:
+            return self.simulator
+        leaves = list(self.leaves)
+        for k, value in zip(self.active, values, strict=True):
+            leaves[k] = value
+        order = iter(leaves)
+        return self.simulator.of_parts(mapped_tensors(self.parts, lambda _: next(order)))
+
+    def step(self, state: S, control: Tensor | None) -> tuple[S, Made]:
+        """See `Simulator.step`."""
+        play = _Step(self, state, control)
+        end = play.perform(state, control)
+        assert play.made is not None
+        return end, play.made
+
+    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
+        """See `Simulator.initial_state`."""
+        play = _Start(self, (q, v), control)
+        start: S = play.perform((q, v), control)
+        return start
+
+
+def _wrapped(value: Tensor) -> bool:
+    """Whether torch.func is at work on a tensor, which then has no memory of its own."""
+    return bool(torch._C._functorch.is_functorch_wrapped_tensor(value))
+
+
+def _unwrapped(value: Tensor) -> Tensor:
+    """The plain tensor inside."""
+    while _wrapped(value):
+        value = torch._C._functorch.get_unwrapped(value)
+    return value.detach()
+
+
+T = TypeVar("T")
+_Function = Callable[..., tuple[Tensor, ...]]
+
+
+class _Play(Generic[T]):
+    """A computation that is made without derivatives first and retraced with them later. Its inputs: all tensors of `start` and of
+    the control, and the simulator's active ones."""
+
+    def __init__(self, linked: Linked[Any], start: Any, control: Tensor | None) -> None:
+        self.linked = linked
+        # without derivatives, and without memory of what is given anyway
+        self._start = mapped_tensors(start, lambda x: x.new_empty(0))
+        self._count = len(tensors_of(start))
+        self._controlled = control is not None
+        self._end: Any = None
+        self.plain: tuple[Tensor, ...] = ()
+
+    def perform(self, start: Any, control: Tensor | None) -> Any:
+        """The end, carrying derivatives."""
+        given = [*tensors_of(start), *([] if control is None else [control])]
+        active = [self.linked.leaves[k] for k in self.linked.active]
+        values = iter(_Implicit.apply(self, *given, *active))  # type: ignore[no-untyped-call]
+        return mapped_tensors(self._end, lambda _: next(values))
+
+    def _unpacked(self, values: Sequence[Tensor]) -> tuple[Any, Tensor | None, Sequence[Tensor]]:
+        order = iter(values)
+        start = mapped_tensors(self._start, lambda _: next(order))
+        control = next(order) if self._controlled else None
+        return start, control, list(order)
+
+    def run(self, values: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Without derivatives."""
+        with torch.no_grad():
+            start, control, active = self._unpacked([x.detach() for x in values])
+            end = self._made(self.linked.plain(active), start, control)
+        self._end = mapped_tensors(end, lambda x: x.new_empty(0))
+        return tuple(tensors_of(end))
+
+    def retraced(self, values: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """With them."""
+        start, control, active = self._unpacked(values)
+        return tuple(tensors_of(self._again(self.linked.with_values(active), start, control)))
+
+    def _made(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+        raise NotImplementedError
+
+    def _again(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+        raise NotImplementedError
+
+
+class _Step(_Play[S]):
+    """A step."""
+
+    made: Made | None = None
+
+    def _made(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
+        end, solution, objective, way = simulator.made(start, control)
+        detours = (solution.status == int(Status.EASED)) | (solution.status == int(Status.HALVED))
+        doubts = int(Doubt.UNSOLVED) * (~solution.solved).int() + int(Doubt.DETOUR) * detours.int()
+        self.made = Made(solution, way, doubts)
+        if simulator.gradients.keep_factors and not way.detours:
+            balance = blurred(objective, simulator.gradients.blur).evaluate(way.q)
+            self.made.factors = Factors.of(balance.jacobian)
+        return end
+
+    def _again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
+        made, policy = self.made, simulator.gradients.doubtful
+        assert made is not None
+        unsolved = (made.doubts & int(Doubt.UNSOLVED)) > 0
+        included = None
+        if bool(unsolved.any()):
+            _complain(policy, unsolved, "unsolved", start.time)
+            included = ~unsolved if policy is Doubtful.ZERO else None
+        end, singular = followed(simulator, start, control, made.way, included, made.factors)
+        singular = _unwrapped(singular)
+        if bool(singular.any()):
+            made.doubts = made.doubts | int(Doubt.SINGULAR) * singular.int()
+            _complain(policy, singular, "singular", start.time)
+            if policy is Doubtful.ZERO:
+                end = _constant(end, singular)
+        return end
+
+
+class _Start(_Play[S]):
+    """The state at t = 0 of a configuration and a velocity."""
+
+    def _made(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+        self._trials: list[tuple[Way, Tensor]] = []
+
+        def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
+            end, solution, _, way = trial.made(state, held)
+            self._trials.append((way, solution.solved))
+            return end, solution.solved
+
+        return simulator.with_attempt(attempt).started(*start, control)
+
+    def _again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+        trials = iter(self._trials)
+
+        def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
+            way, solved = next(trials)
+            return followed(trial, state, held, way)[0], solved
+
+        return simulator.with_attempt(attempt).started(*start, control)
+
+
+def _constant(state: S, worlds: Tensor) -> S:
+    """The state, that of some worlds `[*batch]` without derivatives."""
+
+    def still(x: Tensor) -> Tensor:
+        return torch.where(worlds.reshape(*worlds.shape, *(1,) * (x.ndim - worlds.ndim)), x.detach(), x)
+
+    result: S = mapped_tensors(state, still)
+    return result
+
+
+def _complain(policy: Doubtful, worlds: Tensor, what: str, time: Tensor) -> None:
+    if policy is Doubtful.ZERO:
+        return
+    first = float(_unwrapped(time).reshape(-1)[worlds.reshape(-1)][0])
+    message = (
+        f"the step at t = {first:.6g} s is {what} in {int(worlds.sum())} of {worlds.numel()} worlds and has no derivative there: "
+        "solve it (a smaller dt, other fallbacks), or choose Gradients(doubtful=Doubtful.WARN or Doubtful.ZERO)"
+    )
+    if policy is Doubtful.RAISE:
+        raise GradientError(message)
+    warnings.warn(message, GradientWarning, stacklevel=2)
+
+
+def _pushed(function: _Function, values: list[Tensor], change: list[Tensor]) -> Sequence[Tensor]:
+    """How the ends change with the values, by forward derivatives."""
+    found: tuple[Tensor, ...] = torch.func.jvp(function, tuple(values), tuple(change))[1]
+    return found
+
+
+def _pushed_twice(function: _Function, values: list[Tensor], change: list[Tensor]) -> Sequence[Tensor]:
+    """The same by two backward ones, where forward derivatives, which do not nest, are at work outside: with c ↦ Jᵀc linear, J is
+    its derivative's transpose."""
+    with torch.enable_grad():
+        moved = [x.detach().requires_grad_() for x in values]
+        ends = function(*moved)
+        probes = [torch.zeros_like(e, requires_grad=True) for e in ends]
+        reached = [(e, p) for e, p in zip(ends, probes, strict=True) if e.requires_grad]
+        if not reached:
+            return [torch.zeros_like(e) for e in ends]
+        pulled: Sequence[Tensor | None] = torch.autograd.grad(
+            [e for e, _ in reached], moved, [p for _, p in reached], create_graph=True, allow_unused=True
+        )
+        pairs = [(x, c) for x, c in zip(pulled, change, strict=True) if x is not None and x.requires_grad]
+    found: Sequence[Tensor | None] = torch.autograd.grad([x for x, _ in pairs], probes, [c for _, c in pairs], allow_unused=True)
+    return [torch.zeros_like(e) if x is None else x for x, e in zip(found, ends, strict=True)]
+
+
+class _Context(Protocol):
+    play: _Play[Any]
+    saved_tensors: tuple[Tensor, ...]
+    needs_input_grad: tuple[bool, ...]
+
+
+class _Implicit(torch.autograd.Function):
+    """A play as a node of the graph, which keeps the play's inputs and nothing else."""
+
+    @staticmethod
+    def forward(play: _Play[Any], *values: Tensor) -> tuple[Tensor, ...]:
+        play.plain = tuple(x.detach() for x in values)
+        return play.run(values)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.play = inputs[0]
+        ctx.save_for_backward(*inputs[1:])
+        ctx.mark_non_differentiable(*(x for x in output if not x.is_floating_point()))
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: _Context, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        needed = ctx.needs_input_grad[1:]
+        with torch.enable_grad():
+            values = [x.detach().requires_grad_(need) for x, need in zip(ctx.saved_tensors, needed, strict=True)]
+            ends = ctx.play.retraced(values)
+            pairs = [(e, c) for e, c in zip(ends, cotangents, strict=True) if c is not None and e.requires_grad]
+        wanted = [x for x in values if x.requires_grad]
+        if not pairs or not wanted:
+            return None, *(None for _ in values)
+        found = iter(torch.autograd.grad([e for e, _ in pairs], wanted, [c for _, c in pairs], allow_unused=True))
+        return None, *(next(found) if x.requires_grad else None for x in values)
+
+    @staticmethod
+    def jvp(ctx: _Context, _: None, *tangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        values, play = ctx.play.plain, ctx.play
+        moves = {k: t for k, t in enumerate(tangents) if t is not None and values[k].is_floating_point()}
+        first, change = [values[k] for k in moves], list(moves.values())
+
+        def ends(*moved: Tensor) -> tuple[Tensor, ...]:
+            whole = list(values)
+            for k, x in zip(moves, moved, strict=True):
+                whole[k] = x
+            return play.retraced(whole)
+
+        floating = [x.is_floating_point() for x in tensors_of(play._end)]
+        push = _pushed if any(_wrapped(t) for t in change) else _pushed_twice
+        found = push(lambda *x: tuple(e for e, real in zip(ends(*x), floating, strict=True) if real), first, change)
+        order = iter(found)
+        return tuple(next(order) if real else None for real in floating)
