@@ -20,7 +20,7 @@ from pbfd_torch.errors import GradientError, GradientWarning
 from pbfd_torch.implicit import Doubt, Doubtful, Factors, blurred, followed
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.parameters import mapped_tensors, tensors_of
-from pbfd_torch.solvers.objective import Solution, Status
+from pbfd_torch.solvers.objective import Solution, Status, is_solved
 from pbfd_torch.way import Way
 
 if TYPE_CHECKING:
@@ -32,6 +32,12 @@ def carries(value: Tensor) -> bool:
     if torch.is_grad_enabled() and value.requires_grad:
         return True
     return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
+
+
+def doubts_of(status: Tensor) -> Tensor:
+    """The bits of `Doubt` that are known from values of `Status`."""
+    detours = (status == int(Status.EASED)) | (status == int(Status.HALVED))
+    return int(Doubt.UNSOLVED) * (~is_solved(status)).int() + int(Doubt.DETOUR) * detours.int()
 
 
 @dataclass(eq=False)
@@ -108,7 +114,7 @@ T = TypeVar("T")
 _Function = Callable[..., tuple[Tensor, ...]]
 
 
-class _Play(Generic[T]):
+class Play(Generic[T]):
     """A computation that is made without derivatives first and retraced with them later. Its inputs: all tensors of `start` and of
     the control, and the simulator's active ones."""
 
@@ -138,59 +144,52 @@ class _Play(Generic[T]):
         """Without derivatives."""
         with torch.no_grad():
             start, control, active = self._unpacked([x.detach() for x in values])
-            end = self._made(self.linked.plain(active), start, control)
+            end = self.first(self.linked.plain(active), start, control)
         self._end = mapped_tensors(end, lambda x: x.new_empty(0))
         return tuple(tensors_of(end))
 
     def retraced(self, values: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """With them."""
         start, control, active = self._unpacked(values)
-        return tuple(tensors_of(self._again(self.linked.with_values(active), start, control)))
+        return tuple(tensors_of(self.again(self.linked.with_values(active), start, control)))
 
-    def _made(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+    def first(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+        """Made without derivatives."""
         raise NotImplementedError
 
-    def _again(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+    def again(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+        """The same as a function that carries derivatives."""
         raise NotImplementedError
 
 
-class _Step(_Play[S]):
+class _Step(Play[S]):
     """A step."""
 
     made: Made | None = None
 
-    def _made(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
+    def first(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
         end, solution, objective, way = simulator.made(start, control)
-        detours = (solution.status == int(Status.EASED)) | (solution.status == int(Status.HALVED))
-        doubts = int(Doubt.UNSOLVED) * (~solution.solved).int() + int(Doubt.DETOUR) * detours.int()
-        self.made = Made(solution, way, doubts)
+        self.made = Made(solution, way, doubts_of(solution.status))
         if simulator.gradients.keep_factors and not way.detours:
             balance = blurred(objective, simulator.gradients.blur).evaluate(way.q)
             self.made.factors = Factors.of(balance.jacobian)
         return end
 
-    def _again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
+    def again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
         made, policy = self.made, simulator.gradients.doubtful
         assert made is not None
         unsolved = (made.doubts & int(Doubt.UNSOLVED)) > 0
-        included = None
-        if bool(unsolved.any()):
-            _complain(policy, unsolved, "unsolved", start.time)
-            included = ~unsolved if policy is Doubtful.ZERO else None
+        included = ~unsolved if policy is Doubtful.ZERO and bool(unsolved.any()) else None
         end, singular = followed(simulator, start, control, made.way, included, made.factors)
-        singular = _unwrapped(singular)
-        if bool(singular.any()):
-            made.doubts = made.doubts | int(Doubt.SINGULAR) * singular.int()
-            _complain(policy, singular, "singular", start.time)
-            if policy is Doubtful.ZERO:
-                end = _constant(end, singular)
-        return end
+        made.doubts = complain(policy, made.doubts, singular, start.time)
+        lost = (made.doubts & int(Doubt.SINGULAR)) > 0
+        return _constant(end, lost) if policy is Doubtful.ZERO and bool(lost.any()) else end
 
 
-class _Start(_Play[S]):
+class _Start(Play[S]):
     """The state at t = 0 of a configuration and a velocity."""
 
-    def _made(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+    def first(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
         self._trials: list[tuple[Way, Tensor]] = []
 
         def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
@@ -200,7 +199,7 @@ class _Start(_Play[S]):
 
         return simulator.with_attempt(attempt).started(*start, control)
 
-    def _again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+    def again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
         trials = iter(self._trials)
 
         def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
@@ -220,17 +219,24 @@ def _constant(state: S, worlds: Tensor) -> S:
     return result
 
 
-def _complain(policy: Doubtful, worlds: Tensor, what: str, time: Tensor) -> None:
+def complain(policy: Doubtful, doubts: Tensor, singular: Tensor, time: Tensor) -> Tensor:
+    """The doubts `[*batch]` with those of singular steps; raises `GradientError` or warns where the policy says so."""
+    doubts = doubts | int(Doubt.SINGULAR) * _unwrapped(singular).int()
     if policy is Doubtful.ZERO:
-        return
-    first = float(_unwrapped(time).reshape(-1)[worlds.reshape(-1)][0])
-    message = (
-        f"the step at t = {first:.6g} s is {what} in {int(worlds.sum())} of {worlds.numel()} worlds and has no derivative there: "
-        "solve it (a smaller dt, other fallbacks), or choose Gradients(doubtful=Doubtful.WARN or Doubtful.ZERO)"
-    )
-    if policy is Doubtful.RAISE:
-        raise GradientError(message)
-    warnings.warn(message, GradientWarning, stacklevel=2)
+        return doubts
+    for doubt in (Doubt.UNSOLVED, Doubt.SINGULAR):
+        worlds = ((doubts & int(doubt)) > 0).reshape(-1)
+        if not bool(worlds.any()):
+            continue
+        first = float(_unwrapped(time).reshape(-1)[worlds][0])
+        message = (
+            f"the step at t = {first:.6g} s is {str(doubt.name).lower()} in {int(worlds.sum())} of {len(worlds)} worlds and has no "
+            "derivative there: solve it (a smaller dt, other fallbacks), or give the simulator Gradients with Doubtful.WARN or ZERO"
+        )
+        if policy is Doubtful.RAISE:
+            raise GradientError(message)
+        warnings.warn(message, GradientWarning, stacklevel=2)
+    return doubts
 
 
 def _pushed(function: _Function, values: list[Tensor], change: list[Tensor]) -> Sequence[Tensor]:
@@ -258,7 +264,7 @@ def _pushed_twice(function: _Function, values: list[Tensor], change: list[Tensor
 
 
 class _Context(Protocol):
-    play: _Play[Any]
+    play: Play[Any]
     saved_tensors: tuple[Tensor, ...]
     needs_input_grad: tuple[bool, ...]
 
@@ -267,7 +273,7 @@ class _Implicit(torch.autograd.Function):
     """A play as a node of the graph, which keeps the play's inputs and nothing else."""
 
     @staticmethod
-    def forward(play: _Play[Any], *values: Tensor) -> tuple[Tensor, ...]:
+    def forward(play: Play[Any], *values: Tensor) -> tuple[Tensor, ...]:
         play.plain = tuple(x.detach() for x in values)
         return play.run(values)
 

@@ -18,6 +18,7 @@ from pbfd_torch.implicit import Attempt, Gradients, Parts
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
+from pbfd_torch.linearization import Linearization, linearized
 from pbfd_torch.linked import Linked, carries
 from pbfd_torch.objective import BalanceObjective, blank_memory
 from pbfd_torch.parameters import tensors_of
@@ -27,6 +28,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
 from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.trajectory import Trajectory, trajectory
 from pbfd_torch.way import Detour, Way
 from pbfd_torch.worlds import Worlds, replaced
 
@@ -87,7 +89,7 @@ class Simulator(Generic[S]):
         The start is of second order, or of first order in a world whose trial step is unsolved, if the integrator needs one. Raises
         `InputError` for wrong shapes, dtypes, devices or NaN."""
         q, v = self.scene.placed(q, v)
-        linked = self._linked(q, v, control)
+        linked = self.linked(q, v, control)
         return self.started(q, v, control) if linked is None else linked.initial_state(q, v, control)
 
     def started(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
@@ -127,14 +129,14 @@ class Simulator(Generic[S]):
 
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
         theorem (`implicit`); its values are the same to the bit."""
-        linked = self._linked(state, control)
+        linked = self.linked(state, control)
         if linked is not None:
             advanced, made = linked.step(state, control)
             return advanced, made.solution
         advanced, solution, _ = self._step(state, control)
         return advanced, solution
 
-    def _linked(self, *values: Any) -> Linked[S] | None:
+    def linked(self, *values: Any) -> Linked[S] | None:
         """What differentiates the steps from these values; None where nothing carries derivatives."""
         linked = Linked(self)
         return linked if linked.active or any(map(carries, tensors_of(list(values)))) else None
@@ -142,6 +144,26 @@ class Simulator(Generic[S]):
     def _step(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective]:
         advanced, solution, objective, _ = self.made(state, control)
         return advanced, solution, objective
+
+    def trajectory(
+        self,
+        state: S,
+        controls: Tensor | None = None,
+        steps: int | None = None,
+        checkpoint: int = 1,
+        progress: Callable[[int], object] | None = None,
+    ) -> Trajectory[S]:
+        """Steps from `state` and keeps what carries derivatives: configurations, velocities, and how each step was solved.
+
+        controls, steps: as in `rollout`. checkpoint: keep every so many-th state only, for less memory and about twice the time.
+        progress: called with the number of steps done. Raises `InputError` where controls and steps do not agree."""
+        return trajectory(self, state, controls, steps, checkpoint, progress)
+
+    def linearize(self, state: S, control: Tensor | None = None) -> Linearization[S]:
+        """The step from `state` under `control` `[*batch, nu]` as A `[*batch, nx, nx]` and B `[*batch, nx, nu]` in the coordinates
+        of `Chart`: exact derivatives, all worlds and all rows in one pass. Raises `GradientError` at unsolved and singular
+        steps unless `gradients` says otherwise."""
+        return linearized(self, state, control)
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective, Way]:
         """A step without derivatives, its own balance, and how it was made."""

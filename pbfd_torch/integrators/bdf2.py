@@ -47,6 +47,11 @@ class Bdf2:
         """Implicit Euler."""
         return (_Drop(),)
 
+    @property
+    def coordinates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """See `Integrator`."""
+        return ("q",), ("history", "moves")
+
     def adapted(self, articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
         """The terms themselves, all implicit."""
         return terms

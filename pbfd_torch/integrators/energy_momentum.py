@@ -69,6 +69,11 @@ class EnergyMomentum:
         """The paper's step."""
         return (_PaperStep(),)
 
+    @property
+    def coordinates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """See `Integrator`."""
+        return ("q",), ("v",)
+
     def adapted(self, articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
         """Springs, damping and actuators between the trapezoidal rule and implicit Euler."""
         return fitted(articulation, terms, dt)

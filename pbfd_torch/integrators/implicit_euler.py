@@ -36,6 +36,11 @@ class ImplicitEuler:
         """None: nothing is easier."""
         return ()
 
+    @property
+    def coordinates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """See `Integrator`."""
+        return ("q", "q_previous"), ()
+
     def adapted(self, articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
         """The terms themselves, all implicit."""
         return terms

@@ -94,6 +94,11 @@ class Integrator(Protocol[S]):
         step is unsolved or refused."""
         ...
 
+    @property
+    def coordinates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The state's fields that the next step depends on, besides what terms remember: configurations, and others."""
+        ...
+
     def adapted(self, articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
         """The terms as they act in a step, in the same order."""
         ...

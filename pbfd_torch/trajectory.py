@@ -1,0 +1,137 @@
+"""Trajectories that carry derivatives: the configurations and velocities of a rollout as functions of all that they depend on.
+
+A step's node of the graph keeps the state that it set out from. With checkpoints every k steps only every k-th state is kept, and
+the steps between are made again, to the same bits, when derivatives are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Generic
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.integrator import S
+from pbfd_torch.linked import Linked, Made, Play, carries, doubts_of
+from pbfd_torch.parameters import tensors_of
+from pbfd_torch.solvers.objective import is_solved
+
+if TYPE_CHECKING:
+    from pbfd_torch.simulator import Simulator
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Generic[S]):
+    """`T` steps, time first.
+
+    Attributes:
+        q: `[T + 1, *batch, nq]`.
+        v: `[T + 1, *batch, nv]` as the integrator reports it.
+        end: the state after the last step, to go on from.
+        status: `[T, *batch]` values of `Status`.
+    """
+
+    q: Tensor
+    v: Tensor
+    end: S
+    status: Tensor
+    _made: tuple[Sequence[Made], ...] = ()  # those of a checkpoint's steps once they were retraced
+
+    @property
+    def solved(self) -> Tensor:
+        """`[T, *batch]` bool."""
+        return is_solved(self.status)
+
+    @property
+    def doubts(self) -> Tensor:
+        """`[T, *batch]` bits of `Doubt`: what may be wrong with the derivatives of each step. Singular ones are known once
+        derivatives were asked for."""
+        known = doubts_of(self.status)
+        found = [made.doubts for some in self._made for made in some]
+        return known if len(found) < len(known) else known | torch.stack(found)
+
+
+class _Segment(Play[S]):
+    """Some steps; their node keeps the state before the first of them only."""
+
+    def __init__(self, linked: Linked[S], start: S, controls: Tensor | None, steps: int) -> None:
+        super().__init__(linked, start, controls)
+        self._steps = steps
+        self.made: list[Made] = []
+        self.status: list[Tensor] = []
+
+    def first(self, simulator: Simulator[S], start: S, control: Tensor | None) -> Any:
+        """See `Play`: configurations and velocities after every step, and the last state."""
+        states = [start]
+        for k in range(self._steps):
+            end, solution, *_ = simulator.made(states[-1], None if control is None else control[k])
+            states.append(end)
+            self.status.append(solution.status)
+        return _seen(simulator, states)
+
+    def again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> Any:
+        """See `Play`."""
+        states, linked = [start], Linked(simulator)
+        self.made.clear()
+        for k in range(self._steps):
+            end, made = linked.step(states[-1], None if control is None else control[k])
+            states.append(end)
+            self.made.append(made)
+        return _seen(simulator, states)
+
+
+def _seen(simulator: Simulator[S], states: list[S]) -> tuple[Tensor, Tensor, S]:
+    """Configurations and velocities of all states but the first, and the last one."""
+    a, dt = simulator.articulation, simulator.step_size
+    v = [simulator.integrator.velocity(a, state, dt) for state in states[1:]]
+    return torch.stack([state.q for state in states[1:]]), torch.stack(v), states[-1]
+
+
+def trajectory(
+    simulator: Simulator[S],
+    state: S,
+    controls: Tensor | None,
+    steps: int | None,
+    checkpoint: int,
+    progress: Callable[[int], object] | None,
+) -> Trajectory[S]:
+    """See `Simulator.trajectory`."""
+    if checkpoint < 1:
+        raise InputError(f"checkpoint is {checkpoint}: must be a number of steps ≥ 1")
+    count = simulator.scene.step_count(controls, steps)
+    linked = simulator.linked(state, controls)
+    given = tensors_of([state, controls, *([] if linked is None else linked.leaves)])
+    if any(carries(x) and not x.requires_grad for x in given):
+        checkpoint = 1  # forward derivatives keep nothing, so there is nothing to save
+    q, v = [state.q[None]], [simulator.integrator.velocity(simulator.articulation, state, simulator.step_size)[None]]
+    status: list[Tensor] = []
+    kept: list[Sequence[Made]] = []
+    for k in range(0, count, checkpoint):
+        size = min(checkpoint, count - k)
+        held = None if controls is None else controls[k : k + size]
+        if linked is not None and checkpoint > 1:
+            segment = _Segment(linked, state, held, size)
+            *seen, state = segment.perform(state, held)
+            status += segment.status
+            kept.append(segment.made)
+        else:
+            states = [state]
+            for i in range(size):
+                now = None if held is None else held[i]
+                if linked is None:
+                    end, solution, *_ = simulator.made(states[-1], now)
+                else:
+                    end, made = linked.step(states[-1], now)
+                    solution = made.solution
+                    kept.append([made])
+                states.append(end)
+                status.append(solution.status)
+            *seen, state = _seen(simulator, states)
+        q.append(seen[0])
+        v.append(seen[1])
+        if progress is not None:
+            progress(k + size)
+    return Trajectory(torch.cat(q), torch.cat(v), state, torch.stack(status), tuple(kept))
