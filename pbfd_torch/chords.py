@@ -3,6 +3,8 @@
 For a dof i with twist s̄_i on the chord, at or above dof j, with subtree sums taken at j's joint, w the share of the chord:
     r_i = s̄_i · W,   ∂r_i/∂θ_j = s̄_iᵀ (A + w B) s_j + w s_j · Y_i
 A: how the forces answer a motion; B: how the points on the chord move under forces held still; Y_i: how the axis s̄_i does.
+Within a ball or free rotation that is the slope of r's components about the body's own axes. All other loads have theirs in the
+exponential chart, where it is that of Jr(δ)ᵀ r(q ⊕ δ): less by ½ [r]×. The slopes of loads that balance add up in one chart only.
 """
 
 from __future__ import annotations
@@ -33,8 +35,12 @@ class ChordBalance:
 
     @cached_property
     def curvature(self) -> Tensor:
-        """What `stiffness` lacks of the exact ∂r/∂θ, `[*batch, nv, nv]`."""
-        return self._chord.share[..., None, None] * (self._worked(_moved(self._load.moment_at_end)) + self._turned())
+        """What `stiffness` lacks of the exact ∂r/∂θ in the exponential chart, `[*batch, nv, nv]`."""
+        rows = self._chord.end.articulation.topology.turning_v
+        curved = self._chord.share[..., None, None] * (self._worked(_moved(self._load.moment_at_end)) + self._turned())
+        if len(rows):
+            curved[..., rows[:, :, None], rows[:, None, :]] -= 0.5 * skew(self.residual[..., rows])
+        return curved
 
     def _worked(self, answer: Tensor) -> Tensor:
         """s̄_iᵀ A s_j over the links that both move, of A `[*batch, nlink, 6, 6]`."""

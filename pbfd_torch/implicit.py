@@ -192,8 +192,8 @@ def _joined(batch: tuple[int, ...], pieces: list[tuple[Worlds, S, Tensor]], stat
         own = values[0].shape[1:] if batch else values[0].shape
         whole = values[0].new_zeros((count, *own))
         for (worlds, *_), value in zip(pieces, values, strict=True):
-            whole = whole.index_copy(0, worlds.index, value.reshape(len(worlds.index), *own))
-        return whole.reshape(*batch, *own)
+            whole = whole.index_copy(0, worlds.index, value.reshape((len(worlds.index), *own)))
+        return whole.reshape((*batch, *own))
 
     if not pieces:
         return mapped_tensors(state, torch.zeros_like), torch.zeros_like(state.time, dtype=torch.bool)

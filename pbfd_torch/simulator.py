@@ -60,13 +60,14 @@ class Simulator(Generic[S]):
         halvings: int = 3,
         gradients: Gradients | None = None,
     ) -> None:
-        if not (math.isfinite(dt) and dt >= SHORTEST_STEP):
-            raise InputError(f"dt is {float(dt)} s: must be a finite number ≥ 1e-5")
+        step = float(dt.detach()) if isinstance(dt, Tensor) else dt
+        if not (math.isfinite(step) and step >= SHORTEST_STEP):
+            raise InputError(f"dt is {step} s: must be a finite number ≥ 1e-5")
         if halvings < 0:
             raise InputError(f"halvings is {halvings}: must be ≥ 0")
         a = scene.articulation
         self.scene = scene
-        self.dt = float(dt)
+        self.dt = float(step)
         self.integrator: Integrator[S] = integrator or cast(Integrator[S], EnergyMomentum())
         self.solver: Solver = solver or Fallbacks()
         self.halvings = halvings

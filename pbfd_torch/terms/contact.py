@@ -71,13 +71,13 @@ class Contact:
     Attributes:
         link: `[npoint]` index of the link that carries each candidate.
         position: `[*, npoint, 3]` centre in the link's frame [m].
-        radius: `[npoint]` [m] ≥ 0.
-        margin: `[npoint]` [m] ≥ 0: skin in which the force sets in already.
+        radius: `[*, npoint]` [m] ≥ 0.
+        margin: `[*, npoint]` [m] ≥ 0: skin in which the force sets in already.
         surface: the solid, in its own frame.
         carrier: where that frame is; None: the world's.
         normal_force: Eq. 8.
         friction: the tangential law, or None for a frictionless contact.
-        grip: what the law is multiplied by, `[npoint]`: the μ of every candidate for a law whose own is 1; None: 1.
+        grip: what the law is multiplied by, `[*, npoint]`: the μ of every candidate for a law whose own is 1; None: 1.
         restitution: how much of the speed of an impact comes back; None: nothing.
         thickness: of a convex solid [m]; candidates that may come past its middle in one step meet its tangent plane instead.
         names: the collider that each candidate belongs to.
@@ -142,7 +142,7 @@ class Contact:
 
     def __post_init__(self) -> None:
         zero = torch.zeros_like(self.radius)[None]
-        count = len(self.radius)
+        count = len(self.link)
         try:
             shape = self.normal_force.force(zero)[0].shape
             if self.friction is not None:
@@ -176,7 +176,7 @@ class Contact:
     def memory(self, batch: tuple[int, ...]) -> Tensor:
         """What the anchors are behind by in the solid's frame at a fresh start, `[*batch, npoint, 3]`; without anchors nothing,
         `[*batch, 0, 3]`."""
-        count = len(self.radius) if isinstance(self.friction, AnchoredFriction) else 0
+        count = len(self.link) if isinstance(self.friction, AnchoredFriction) else 0
         return self.position.new_zeros((*batch, count, 3))
 
     def recall(self, step: StepContext, memory: Tensor) -> PreparedContact:
@@ -224,6 +224,9 @@ class Contact:
         return replaced(
             self,
             position=worlds.pick(self.position, 2),
+            radius=worlds.pick(self.radius, 1),
+            margin=worlds.pick(self.margin, 1),
+            grip=None if self.grip is None else worlds.pick(self.grip, 1),
             surface=self.surface.take(worlds),
             carrier=None if self.carrier is None else self.carrier.take(worlds),
             normal_force=self.normal_force.take(worlds),
