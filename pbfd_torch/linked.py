@@ -20,6 +20,7 @@ from pbfd_torch.errors import GradientError, GradientWarning
 from pbfd_torch.implicit import Doubt, Doubtful, Factors, blurred, followed
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.parameters import mapped_tensors, tensors_of
+from pbfd_torch.plain import plain, wrapped
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
 from pbfd_torch.way import Way
 
@@ -65,7 +66,7 @@ class Linked(Generic[S]):
         self.simulator = simulator
         self.parts = simulator.parts
         self.leaves = tensors_of(self.parts)
-        self.active = [k for k, x in enumerate(self.leaves) if carries(x) or _wrapped(x)]
+        self.active = [k for k, x in enumerate(self.leaves) if carries(x) or wrapped(x)]
         self._plain: Simulator[S] | None = None
 
     def plain(self, values: Sequence[Tensor]) -> Simulator[S]:
@@ -96,18 +97,6 @@ class Linked(Generic[S]):
         play = _Start(self, (q, v), control)
         start: S = play.perform((q, v), control)
         return start
-
-
-def _wrapped(value: Tensor) -> bool:
-    """Whether torch.func is at work on a tensor, which then has no memory of its own."""
-    return bool(torch._C._functorch.is_functorch_wrapped_tensor(value))
-
-
-def _unwrapped(value: Tensor) -> Tensor:
-    """The plain tensor inside."""
-    while _wrapped(value):
-        value = torch._C._functorch.get_unwrapped(value)
-    return value.detach()
 
 
 T = TypeVar("T")
@@ -197,7 +186,8 @@ class _Start(Play[S]):
             self._trials.append((way, solution.solved))
             return end, solution.solved
 
-        return simulator.with_attempt(attempt).started(*start, control)
+        # what a node gives back must not share memory with what it was given, nor among itself, for forward derivatives
+        return mapped_tensors(simulator.with_attempt(attempt).started(*start, control), torch.clone)
 
     def again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
         trials = iter(self._trials)
@@ -221,14 +211,14 @@ def _constant(state: S, worlds: Tensor) -> S:
 
 def complain(policy: Doubtful, doubts: Tensor, singular: Tensor, time: Tensor) -> Tensor:
     """The doubts `[*batch]` with those of singular steps; raises `GradientError` or warns where the policy says so."""
-    doubts = doubts | int(Doubt.SINGULAR) * _unwrapped(singular).int()
+    doubts = doubts | int(Doubt.SINGULAR) * plain(singular).int()
     if policy is Doubtful.ZERO:
         return doubts
     for doubt in (Doubt.UNSOLVED, Doubt.SINGULAR):
         worlds = ((doubts & int(doubt)) > 0).reshape(-1)
         if not bool(worlds.any()):
             continue
-        first = float(_unwrapped(time).reshape(-1)[worlds][0])
+        first = float(plain(time).reshape(-1)[worlds][0])
         message = (
             f"the step at t = {first:.6g} s is {str(doubt.name).lower()} in {int(worlds.sum())} of {len(worlds)} worlds and has no "
             "derivative there: solve it (a smaller dt, other fallbacks), or give the simulator Gradients with Doubtful.WARN or ZERO"
@@ -311,7 +301,7 @@ class _Implicit(torch.autograd.Function):
             return play.retraced(whole)
 
         floating = [x.is_floating_point() for x in tensors_of(play._end)]
-        push = _pushed if any(_wrapped(t) for t in change) else _pushed_twice
+        push = _pushed if any(wrapped(t) for t in change) else _pushed_twice
         found = push(lambda *x: tuple(e for e, real in zip(ends(*x), floating, strict=True) if real), first, change)
         order = iter(found)
         return tuple(next(order) if real else None for real in floating)
