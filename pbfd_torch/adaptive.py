@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Generic, Self
+from typing import Any, Generic, Self
 
 import torch
 from torch import Tensor
@@ -18,10 +18,12 @@ from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.kinematics import place
+from pbfd_torch.linked import Linked
 from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import SHORTEST_STEP, Simulator, Solver, put
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
+from pbfd_torch.way import Way
 from pbfd_torch.worlds import Worlds, replaced
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
@@ -59,6 +61,20 @@ class AdaptiveSimulator(Simulator[S]):
             while frame.advance():
                 pass
             return frame.finish()
+
+    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
+        """As that of a simulator with steps of the frame's length."""
+        return self._fixed.initial_state(q, v, control)
+
+    def linked(self, *values: Any) -> Linked[S] | None:
+        """Raises `InputError` where something carries derivatives: which steps are taken depends on it, but not smoothly."""
+        if super().linked(*values) is None:
+            return None
+        raise InputError("the steps of an AdaptiveSimulator carry no derivatives: detach what requires them, or use a Simulator")
+
+    def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective, Way]:
+        """Steps of no one length are made in no one way: raises `InputError`, as trajectories and linearisations need one."""
+        raise InputError("an AdaptiveSimulator has rollouts only: use a Simulator for trajectories and linearisations")
 
     def take(self, worlds: Worlds) -> Self:
         """The simulator of some worlds."""

@@ -66,7 +66,8 @@ def _named(value: Any, name: str) -> Iterator[tuple[str, float | Tensor]]:
         yield name, value
     elif isinstance(value, list | tuple):
         for k, x in enumerate(value):
-            yield from _named(x, f"{name}.{k}")
+            if not isinstance(x, float):  # what is a tuple of numbers stays one
+                yield from _named(x, f"{name}.{k}")
     else:
         for key, x in _fields(value):
             yield from _named(x, f"{name}.{key}")

@@ -25,10 +25,17 @@ from pbfd_torch.terms.joint_limits import JointLimits
 from tests.finite_differences import derivative
 from tests.random_trees import generator
 
-POSES = ("joint_frame", "link_frame", "start")
-AXES = ("joint_axis", "normal")
-FLOOR = 1e-3  # of the end, which is of the size of 1
+POSES = ("joint_frame", "link_frame", "carrier.start")
+AXES = ("joint_axis", "normal", "normals")
+FLOOR = 1e-3  # the end is of the size of 1, and so are its largest derivatives
+SHARED = (".normals", ".offsets", ".starts", ".ends", ".coefficients", ".origin", ".spacing")
 PRECISE = 1e-13  # of the weight: differences see the solver's tolerance
+
+
+def kind(name: str) -> str:
+    """What a parameter is, by its name."""
+    parts = name.split(".")
+    return "carrier.start" if parts[-2:] == ["carrier", "start"] else parts[-1]
 
 
 def precise_solver() -> Fallbacks:
@@ -57,7 +64,7 @@ class Experiment:
     @property
     def values(self) -> dict[str, Tensor]:
         """Everything that the end depends on smoothly, by name. Radii of candidates that are all points are left out: with the
-        first radius above zero they begin to roll."""
+        first radius above zero they begin to roll; and so are the tables of hulls and grids, which all worlds share."""
         own = {"q": self.q, "v": self.v, "dt": torch.tensor(self.dt, dtype=self.q.dtype)}
         if self.control is not None and self.control.numel():
             own["control"] = self.control
@@ -66,7 +73,7 @@ class Experiment:
         for name, x in found.items():
             if name.endswith((".lower", ".upper")) and not limits:
                 continue
-            if name.endswith(".radius") and not bool((x > 0).any()):
+            if name.endswith(SHARED) or (name.endswith("1.radius") and not bool((x > 0).any())):
                 continue
             own[name] = x
         return own
@@ -97,8 +104,8 @@ class Experiment:
         random = generator(seed)
         found = {}
         for name, value in self.values.items():
-            last = name.rsplit(".", 1)[-1]
-            shape = value.shape
+            last = kind(name)
+            shape = tuple(value.shape)
             if name == "q" or last == "rest":
                 shape = (self.scene.articulation.nv,)
             elif last in POSES:
@@ -115,14 +122,16 @@ class Experiment:
             else:
                 size = value.abs().clamp_min(1e-3)
                 found[name] = size * noise if value.ndim else 0.3 * size
-            if name.startswith("terms") and shape == (self.scene.articulation.nv,):  # one number for all axes of a rotation
+            if name.startswith("terms") and shape == tuple(value.shape) == (
+                self.scene.articulation.nv,
+            ):  # one number for all axes of a rotation
                 rows = self.scene.articulation.topology.turning_v
                 found[name][rows] = found[name][rows[:, :1]].expand_as(rows) * (value[rows] != 0)
         return found
 
     def moved(self, name: str, direction: Tensor, t: Tensor) -> Tensor:
         """The value at t `[*]` along its path."""
-        value, last = self.values[name], name.rsplit(".", 1)[-1]
+        value, last = self.values[name], kind(name)
         step = t[(..., *(None,) * direction.ndim)] * direction
         if name == "q" or last == "rest":
             return retract(self.scene.articulation, value.expand(*step.shape[:-1], -1), step)
@@ -151,7 +160,7 @@ class Found:
 
 
 def compared(
-    experiment: Experiment, largest: float = 1e-2, levels: int = 12, names: tuple[str, ...] | None = None
+    experiment: Experiment, largest: float = 1e-2, levels: int = 10, names: tuple[str, ...] | None = None
 ) -> dict[str, Found]:
     """The derivative by every value along a random direction."""
     directions = experiment.directions()
@@ -163,22 +172,24 @@ def compared(
     (implicit,) = torch.autograd.grad(end.sum(), at)
 
     statuses: list[Tensor] = []
+    own = torch.eye(len(names), dtype=experiment.q.dtype)
 
     def moved(t: Tensor) -> Tensor:
-        """`[m, len(names)]`, one of the names at a time."""
-        worlds = {name: experiment.moved(name, directions[name], t[:, k]) for k, name in enumerate(names)}
-        worlds = {name: _per_world(experiment, name, x) for name, x in worlds.items()}
-        found, status = experiment.end({"q": experiment.q.expand(len(t), -1)} | worlds)
+        """`[m, len(names), 1]` → `[m, len(names)]`: every name has worlds of its own, in which only it moves."""
+        worlds = {"q": experiment.q.expand(*t.shape[:-1], -1)}
+        for k, name in enumerate(names):
+            worlds[name] = _per_world(experiment, name, experiment.moved(name, directions[name], t[..., 0] * own[k]))
+        found, status = experiment.end(worlds)
         statuses.append(status)
         return found
 
     with torch.no_grad():
-        differences = derivative(moved, len(names), largest=largest, levels=levels)
+        differences = derivative(moved, 1, (len(names),), largest=largest, levels=levels)
     (status,) = statuses
-    same = (status == status[:, :1]).all(0).reshape(levels * 2, len(names)).all(0)
+    same = (status == status[:, :1]).all(0).all(0)
     return {
         name: Found(float(a), float(b), bool(c))
-        for name, a, b, c in zip(names, implicit, differences.reshape(-1), same, strict=True)
+        for name, a, b, c in zip(names, implicit, differences.squeeze(-1), same, strict=True)
     }
 
 
@@ -186,5 +197,5 @@ def _per_world(experiment: Experiment, name: str, value: Tensor) -> Tensor:
     """A number per world as those that take one per candidate have it."""
     own = experiment.values[name].ndim
     if name.endswith("normal"):  # of planes, one for all candidates
-        return value[:, None]
-    return value[:, None] if own == 0 and name != "dt" else value
+        return value[..., None, :]
+    return value[..., None] if own == 0 and name != "dt" else value

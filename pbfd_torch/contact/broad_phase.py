@@ -16,6 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pbfd_torch.plain import plain
+
 _ROUNDING = 1e-14  # of a corner's coordinates: FCL's own boxes are no smaller than ours
 
 
@@ -59,7 +61,7 @@ class FclTree:
         import fcl
 
         batch = lower.shape[:-2]
-        low, high = (x.detach().to("cpu", torch.float64).reshape(-1, *x.shape[-2:]).numpy() for x in (lower, upper))
+        low, high = (plain(x).to("cpu", torch.float64).reshape(-1, *x.shape[-2:]).numpy() for x in (lower, upper))
         middle = 0.5 * (high + low)
         size = np.maximum(high - low, 0.0) + _ROUNDING * np.maximum(np.abs(low), np.abs(high))
         found = np.zeros((len(low), len(self._number)), dtype=bool)

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
+from pbfd_torch.plain import plain
 
 _DEEPER = 0.05  # a face is taken where its depth is at most this share larger than the smallest …
 _SLACK = 1e-4  # … or its separation at most this share of the smaller body's size less than the largest
@@ -194,7 +195,7 @@ def _witnesses(geometries: Sequence[Any], a: Tensor, b: Tensor, rotation: Tensor
     import fcl
 
     request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=True)
-    turns, shifts = (x.detach().cpu().double().numpy() for x in (rotation, translation))
+    turns, shifts = (plain(x).cpu().double().numpy() for x in (rotation, translation))
     points = np.zeros((len(turns), 2, 3))
     for k, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
         result = fcl.DistanceResult()

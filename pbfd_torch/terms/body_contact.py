@@ -111,13 +111,13 @@ class BodyContact:
 
     def recall(self, step: StepContext, memory: Tensor) -> PreparedBodyContact:
         """`prepare` with what the anchors were behind by at the end of the last step."""
-        with torch.no_grad():
-            links, target = step.previous.poses, step.target_poses
-            obstacles = self._standing(links, step.time + step.dt)
-            bodies = torch.cat((links, self._standing(links, step.time)), -3)
-            ahead = torch.cat((target.expand_as(links), obstacles), -3)
+        links, target = step.previous.poses, step.target_poses
+        obstacles = self._standing(links, step.time + step.dt)
+        bodies = torch.cat((links, self._standing(links, step.time)), -3)
+        ahead = torch.cat((target.expand_as(links), obstacles), -3)
+        with torch.no_grad():  # which candidates there are does not change smoothly; where they are does
             reach = 1.5 * self._travel(bodies, ahead) + self.slack
-            slots = self._found(bodies, reach)
+        slots = self._found(bodies, reach)
         first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
         turn = second[..., :3].mT
         start = (turn @ (mapped(first, slots.position) - second[..., 3])[..., None]).squeeze(-1)

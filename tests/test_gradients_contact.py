@@ -1,0 +1,111 @@
+"""Derivatives through contact with solids of every kind, still and moving, and between bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.height_field import HeightField
+from pbfd_torch.contact.mesh_distance import Mesh
+from pbfd_torch.contact.motion import Conveyor, Lift, Turntable
+from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Shape, Sphere
+from pbfd_torch.integrators.named import INTEGRATORS
+from pbfd_torch.parameters import parameters, with_parameters
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.normal_force import NormalForce
+from tests.gradient_checks import Experiment, compared
+from tests.random_trees import generator
+from tests.test_obstacle_physics import TOPS, on
+from tests.touching_bodies import Pose, free_bodies, posed
+
+SOFT = NormalForce(1e6)
+SLIDING = CoulombFriction(0.4, slip_speed=1e-2)
+MOVING = {
+    "turntable": HalfSpace(motion=Turntable(1.5, (0.2, 0.1, 1.0), (0.5, 0.1, 0.0))),
+    "lift": HalfSpace(motion=Lift(lambda time: 0.1 * torch.sin(3 * time))),
+    "conveyor": HalfSpace(motion=Conveyor((0.4, 0.1, 0.0))),
+}
+
+
+def wrong(experiment: Experiment, largest: float = 3e-3) -> dict[str, tuple[float, float]]:
+    """The derivatives that are off by more than 1e-7, relative, with their differences."""
+    found = compared(experiment, largest=largest)
+    return {n: (f.implicit, f.differences) for n, f in found.items() if not (f.same and f.error <= 1e-7)}
+
+
+def thrown(obstacle: Obstacle | HalfSpace, shape: Shape, friction: CoulombFriction | AnchoredFriction = SLIDING) -> Experiment:
+    """A body that sinks into the top of an obstacle as it slides and turns."""
+    scene = on(obstacle, shape, friction, SOFT)
+    depth = {Sphere: 0.1, Box: 0.05, Capsule: 0.1}[type(shape)]
+    q = posed((0.02, 0.01, depth - 2e-3, 0.05, 0.02, 0.1))[0]
+    v = torch.tensor([0.5, 0.2, -0.1, 0.3, -0.2, 0.4], dtype=torch.float64)
+    return Experiment(scene, 0.01, INTEGRATORS["energy-momentum"], q, v)
+
+
+@pytest.mark.parametrize("solid", TOPS)
+@pytest.mark.parametrize("shape", [Sphere(0.1), Box((0.1, 0.1, 0.05))], ids=["sphere", "box"])
+def test_obstacles(solid: str, shape: Shape) -> None:
+    """By the state, the numbers of the body and the contact, and where the obstacle stands: ≤ 1e-7 of central differences."""
+    assert not wrong(thrown(TOPS[solid], shape))
+
+
+@pytest.mark.parametrize("motion", MOVING)
+def test_moving_ground(motion: str) -> None:
+    """A box that sticks and slides on ground that turns, rises or runs: ≤ 1e-7 of central differences."""
+    assert not wrong(thrown(MOVING[motion], Box((0.1, 0.1, 0.05))))
+
+
+def test_height_field() -> None:
+    """A sphere on a wavy terrain."""
+    terrain = HeightField.from_function(lambda x, y: 0.03 * np.sin(3 * x) * np.cos(2 * y), (2.0, 2.0), 0.1)
+    assert not wrong(thrown(Obstacle("terrain", terrain), Sphere(0.1)), largest=3e-4)
+
+
+def test_mesh() -> None:
+    """A sphere that presses into the middle of a cube's top, whose distance is a spline."""
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces), cell=0.1, margin=0.5)
+    assert not wrong(thrown(Obstacle("cube", mesh, (0.0, 0.0, -0.5)), Sphere(0.1)))
+
+
+@pytest.mark.parametrize("stretch", [1e-2, 1e-4], ids=["stuck", "dragged"])
+def test_anchors(stretch: float) -> None:
+    """What anchors remember is followed from step to step."""
+    assert not wrong(thrown(TOPS["box"], Box((0.1, 0.1, 0.05)), AnchoredFriction(0.4, stretch)))
+
+
+BOTH = ("q", "v", "dt", "gravity", "articulation.pseudo_inertia")
+MEETINGS: dict[str, tuple[tuple[Shape, ...], tuple[Pose, ...]]] = {
+    "sphere on sphere": ((Sphere(0.1), Sphere(0.1)), ((0, 0, 0.0999), (0.02, 0.01, 0.2974))),
+    "sphere on box": ((Box((0.1, 0.1, 0.05)), Sphere(0.1)), ((0, 0, 0.0498, 0.01, 0, 0), (0.02, 0.01, 0.1996))),
+    "box on box": ((Box((0.1, 0.1, 0.05)), Box((0.08, 0.07, 0.05))), ((0, 0, 0.0498), (0.01, 0.01, 0.1495, 0.003, 0.002, 0.3))),
+    "edge on box": ((Box((0.1, 0.1, 0.05)), Box((0.08, 0.07, 0.05))), ((0, 0, 0.0498), (0.01, 0.01, 0.17, 0.3, 0.2, 0.3))),
+    "capsules": ((Capsule(0.05, 0.1), Capsule(0.05, 0.1)), ((0, 0, 0.0499, 0, 1.5, 0), (0.02, 0.01, 0.1496, 1.5, 0, 0))),
+    "hull on box": (
+        (Box((0.1, 0.1, 0.05)), ConvexHull(0.1 * torch.randn(9, 3, dtype=torch.float64, generator=generator(3)).numpy())),
+        ((0, 0, 0.0498), (0.01, 0.01, 0.2, 0.3, 0.2, 0.3)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MEETINGS)
+@pytest.mark.parametrize("integrator", ["implicit-euler", "energy-momentum"])
+def test_bodies_that_meet(name: str, integrator: str) -> None:
+    """Two free bodies on the ground and on each other; the points and planes of the contact follow the bodies' poses at the start
+    of each step. All contacts soft, so that differences see little of their rounding: ≤ 1e-6, and 1e-5 where FCL finds the
+    direction of contact, to less than full precision."""
+    shapes, poses = MEETINGS[name]
+    v = torch.tensor([0.0] * 6 + [0.1, 0.05, -0.3, 0.2, 0.1, 0.3], dtype=torch.float64)
+    scene = free_bodies(shapes, [1.0, 0.7])
+    soft = {x: torch.tensor(1e6, dtype=torch.float64) for x in parameters(scene) if x.endswith("force.stiffness")}
+    experiment = Experiment(with_parameters(scene, soft), 0.01, INTEGRATORS[integrator], posed(*poses)[0], v)
+    found = compared(
+        experiment, largest=1e-3, names=tuple(x for x in experiment.values if x in BOTH or x.endswith((".mu", "force.stiffness")))
+    )
+    most = 1e-5 if "hull" in name else 1e-6
+    assert not {n: (f.implicit, f.differences) for n, f in found.items() if not (f.same and f.error <= most)}
