@@ -271,7 +271,9 @@ def lever(articulation: Articulation) -> Tensor:
 def reach(articulation: Articulation) -> Tensor:
     """Length scale of the articulation [m] `[*]`, at least 1 cm: distances from joint to joint summed, plus the largest radius of
     gyration of a link about its own frame."""
-    frames = torch.cat((articulation.joint_frame[..., :3, 3], articulation.link_frame[..., :3, 3]), -2)
+    each = articulation.joint_frame[..., :3, 3], articulation.link_frame[..., :3, 3]
+    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in each))
+    frames = torch.cat([x.expand(*batch, *x.shape[-2:]) for x in each], -2)
     second = articulation.pseudo_inertia[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0)
     mass = articulation.mass
     gyration = (second / torch.where(mass > 0, mass, torch.ones_like(mass))).sqrt().amax(-1)

@@ -2,6 +2,7 @@
 
 from pbfd_torch.identify.case import Case
 from pbfd_torch.identify.certainty import Certainty, certainty
+from pbfd_torch.identify.columns import linearized
 from pbfd_torch.identify.identification import Experiment, Identification, Identified, Prior
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Fit, Outcome, Stopping, levenberg_marquardt
 from pbfd_torch.identify.measurements import Configurations, Markers, Measurement
@@ -30,4 +31,5 @@ __all__ = [
     "Unknown",
     "certainty",
     "levenberg_marquardt",
+    "linearized",
 ]

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 from tqdm import tqdm
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.identify.case import Case
 from pbfd_torch.identify.certainty import Certainty, certainty
+from pbfd_torch.identify.columns import linearized
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Fit, Stopping, levenberg_marquardt
 from pbfd_torch.identify.measurements import Measurement
 from pbfd_torch.identify.unknowns import Quantity, Unknown
@@ -142,14 +142,7 @@ class Identification:
 
     def linearized(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The residual `[*batch, m]` of x `[*batch, n]` and its Jacobian `[*batch, m, n]`."""
-        n = x.shape[-1]
-        worlds = x.detach().expand(n, *x.shape).clone()
-        along = torch.eye(n, dtype=x.dtype, device=x.device).reshape(n, *(1,) * (x.ndim - 1), n).expand_as(worlds).clone()
-        with forward_ad.dual_level():
-            found = forward_ad.unpack_dual(self.residual(forward_ad.make_dual(worlds, along)))
-        residual, columns = found.primal, found.tangent
-        columns = torch.zeros_like(residual) if columns is None else columns
-        return residual[0].detach(), columns.movedim(0, -1).detach()
+        return linearized(self.residual)(x)
 
     def fit(
         self,

@@ -18,9 +18,10 @@ from pbfd_torch.errors import InputError
 Linearized = Callable[[Tensor], tuple[Tensor, Tensor]]
 """x `[*batch, n]` → residual `[*batch, m]` and its exact Jacobian `[*batch, m, n]`. Row k must depend on row k of x only."""
 
-FIRST_DAMPING = 1e-3  # of the largest diagonal entry of JᵀJ
-LEAST_DAMPING = 1e-14
+FIRST_DAMPING = 1e-4  # of the diagonal of JᵀJ
+LEAST_DAMPING = 1e-10
 MOST_DAMPING = 1e12
+FLOOR = 1e-6  # of the largest entry of that diagonal: what the data hardly see moves little
 
 
 class Outcome(enum.IntEnum):
@@ -55,7 +56,7 @@ class Bounds:
 
     Attributes:
         lower, upper: `[n]`, ∓inf where there is none.
-        scale: `[n]` > 0, the size of a change of x that matters: steps are damped as changes in units of it.
+        scale: `[n]` > 0, the size of a change of x that matters: what the data hardly see is damped as changes in units of it.
     """
 
     lower: Tensor
@@ -124,8 +125,7 @@ def levenberg_marquardt(
     cost = _cost(r, J)
     outcome = torch.where(torch.isfinite(cost), int(Outcome.EXHAUSTED), int(Outcome.BROKEN)).to(torch.int32)
     running = torch.isfinite(cost)
-    size = _hessian(J, scale).diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(torch.finfo(x.dtype).tiny)
-    damping, growth = FIRST_DAMPING * size, torch.full_like(size, 2.0)
+    damping, growth = torch.full_like(cost, FIRST_DAMPING), torch.full_like(cost, 2.0)
     history = [cost]
     for k in range(stopping.iterations):
         gradient = scale * (r[..., None, :] @ J).squeeze(-2)
@@ -146,13 +146,13 @@ def levenberg_marquardt(
         )
         ratio = gained / torch.where(foreseen > 0, foreseen, torch.ones_like(foreseen))
         eased = damping * (1 - (2 * ratio - 1).clamp(-1, 1) ** 3).clamp_min(1 / 3)
-        damping = torch.where(better, eased, damping * growth).clamp(min=LEAST_DAMPING * size)
+        damping = torch.where(better, eased, damping * growth).clamp_min(LEAST_DAMPING)
         growth = torch.where(better, 2.0, 2 * growth)
         x = torch.where(better[..., None], trial, x)
         r = torch.where(better[..., None], r_trial, r)
         J = torch.where(better[..., None, None], J_trial, J)
         cost = torch.where(better, cost_trial, cost)
-        stalled = running & ~done & ~better & (damping > MOST_DAMPING * size)
+        stalled = running & ~done & ~better & (damping > MOST_DAMPING)
         outcome = torch.where(done, int(Outcome.CONVERGED), torch.where(stalled, int(Outcome.STALLED), outcome))
         running = running & ~done & ~stalled
         history.append(cost)
@@ -177,9 +177,10 @@ def _hessian(jacobian: Tensor, scale: Tensor) -> Tensor:
 
 
 def _step(hessian: Tensor, gradient: Tensor, held: Tensor, damping: Tensor) -> Tensor:
-    """−(H + λI)⁻¹ g `[*batch, n]` of the components that are not held."""
+    """−(H + λD)⁻¹ g `[*batch, n]` of the components that are not held, D the diagonal of H with a floor."""
     free = (~held).to(gradient.dtype)
-    eye = torch.eye(gradient.shape[-1], dtype=gradient.dtype, device=gradient.device)
-    matrix = free[..., :, None] * hessian * free[..., None, :] + damping[..., None, None] * eye
+    diagonal = hessian.diagonal(dim1=-2, dim2=-1)
+    least = (FLOOR * diagonal.amax(-1, keepdim=True)).clamp_min(torch.finfo(gradient.dtype).tiny)
+    matrix = free[..., :, None] * hessian * free[..., None, :] + torch.diag_embed(damping[..., None] * (diagonal + least))
     found, _ = torch.linalg.solve_ex(matrix, -(free * gradient).nan_to_num(0.0, 0.0, 0.0)[..., None])
-    return free * found.squeeze(-1)
+    return free * found.squeeze(-1).nan_to_num(0.0, 0.0, 0.0)

@@ -111,6 +111,8 @@ class Markers:
 
 def _aligned(samples: Tensor, rank: int) -> Tensor:
     """The samples with as many dimensions as the simulation, whose own leading ones of the batch come after the steps."""
+    if samples.ndim > rank:
+        raise InputError(f"there are data sets of shape {tuple(samples.shape)}: x must have a row for each of them")
     return samples.reshape(len(samples), *(1,) * (rank - samples.ndim), *samples.shape[1:])
 
 
