@@ -17,7 +17,7 @@ from pbfd_torch.implicit import Doubt, Doubtful, followed
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.kinematics import difference, retract
 from pbfd_torch.linked import complain, doubts_of
-from pbfd_torch.parameters import mapped_tensors, tensors_of
+from pbfd_torch.parameters import in_dtype, mapped_tensors, tensors_of
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.worlds import replaced
 
@@ -95,19 +95,22 @@ def linearized(simulator: Simulator[S], state: S, control: Tensor | None) -> Lin
     nu = simulator.scene.nu
     end, solution, _, way = simulator.made(state, control)
     doubts = doubts_of(solution.status)
-    before, after = Chart(simulator, state), Chart(simulator, end)
+    precise = simulator.precise()
+    before, after = (Chart(precise, in_dtype(x, torch.float64)) for x in (state, end))
     # one copy of the batch for every coordinate of the end: a single pass back gives a row of A and B each
-    x = state.q.new_zeros((after.size, *state.time.shape, before.size), requires_grad=True)
-    held = state.q.new_zeros(nu) if control is None else control.detach()
+    like = before.state.q
+    x = like.new_zeros((after.size, *state.time.shape, before.size), requires_grad=True)
+    held = like.new_zeros(nu) if control is None else control.detach().double()
     u = held.expand(after.size, *state.time.shape, nu).clone().requires_grad_()
     with torch.enable_grad():
-        reached, singular = followed(simulator, before.at(x), u if nu else None, way.repeated(after.size))
+        reached, singular = followed(precise, before.at(x), u if nu else None, way.repeated(after.size))
         rows = after.of(reached)
     seed = torch.eye(after.size, dtype=x.dtype, device=x.device)
     seed = seed.reshape(after.size, *(1,) * state.time.ndim, after.size).expand_as(rows)
     found = torch.autograd.grad(rows, (x, u), seed, allow_unused=True, materialize_grads=True)
     policy = simulator.gradients.doubtful
-    doubts = complain(policy, doubts, singular[0], state.time)
+    doubts = doubts | int(Doubt.SINGULAR) * singular[0].int()
+    complain(policy, doubts, state.time)
     lost = (doubts & int(Doubt.UNSOLVED | Doubt.SINGULAR)) > 0 if policy is Doubtful.ZERO else torch.zeros_like(doubts) > 0
-    A, B = (torch.where(lost[..., None, None], 0.0, g.movedim(0, -2)) for g in found)
+    A, B = (torch.where(lost[..., None, None], 0.0, g.movedim(0, -2)).to(state.q.dtype) for g in found)
     return Linearization(A, B, end, solution, doubts)

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.autograd.function import once_differentiable
 
 from pbfd_torch.errors import GradientError, GradientWarning
-from pbfd_torch.implicit import Doubt, Doubtful, Factors, blurred, followed
+from pbfd_torch.implicit import Doubt, Doubtful, Factors, followed
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.parameters import mapped_tensors, tensors_of
+from pbfd_torch.parameters import in_dtype, mapped_tensors, tensors_of
 from pbfd_torch.plain import plain, wrapped
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
 from pbfd_torch.way import Way
@@ -48,13 +47,13 @@ class Made:
     Attributes:
         solution: how it was solved; way: how it was made.
         doubts: `[*batch]` int, bits of `Doubt`.
-        factors: those of J where they are kept.
+        factors: those of J once they are there, if they are to be kept.
     """
 
     solution: Solution
     way: Way
     doubts: Tensor
-    factors: Factors | None = None
+    factors: list[Factors] | None = None
 
 
 class Linked(Generic[S]):
@@ -87,7 +86,7 @@ class Linked(Generic[S]):
 
     def step(self, state: S, control: Tensor | None) -> tuple[S, Made]:
         """See `Simulator.step`."""
-        play = _Step(self, state, control)
+        play = Step(self, state, control)
         end = play.perform(state, control)
         assert play.made is not None
         return end, play.made
@@ -151,17 +150,14 @@ class Play(Generic[T]):
         raise NotImplementedError
 
 
-class _Step(Play[S]):
+class Step(Play[S]):
     """A step."""
 
     made: Made | None = None
 
     def first(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
-        end, solution, objective, way = simulator.made(start, control)
-        self.made = Made(solution, way, doubts_of(solution.status))
-        if simulator.gradients.keep_factors and not way.detours:
-            balance = blurred(objective, simulator.gradients.blur).evaluate(way.q)
-            self.made.factors = Factors.of(balance.jacobian)
+        end, solution, _, way = simulator.made(start, control)
+        self.made = Made(solution, way, doubts_of(solution.status), [] if simulator.gradients.keep_factors else None)
         return end
 
     def again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
@@ -169,10 +165,14 @@ class _Step(Play[S]):
         assert made is not None
         unsolved = (made.doubts & int(Doubt.UNSOLVED)) > 0
         included = ~unsolved if policy is Doubtful.ZERO and bool(unsolved.any()) else None
-        end, singular = followed(simulator, start, control, made.way, included, made.factors)
-        made.doubts = complain(policy, made.doubts, singular, start.time)
+        dtype = start.time.dtype
+        wide, held = simulator.precise(), None if control is None else control.double()
+        end, singular = followed(wide, in_dtype(start, torch.float64), held, made.way, included, made.factors)
+        made.doubts = made.doubts | int(Doubt.SINGULAR) * plain(singular).int()
+        complain(policy, made.doubts, start.time)
         lost = (made.doubts & int(Doubt.SINGULAR)) > 0
-        return _constant(end, lost) if policy is Doubtful.ZERO and bool(lost.any()) else end
+        end = _constant(end, lost) if policy is Doubtful.ZERO and bool(lost.any()) else end
+        return in_dtype(end, dtype)
 
 
 class _Start(Play[S]):
@@ -190,13 +190,16 @@ class _Start(Play[S]):
         return mapped_tensors(simulator.with_attempt(attempt).started(*start, control), torch.clone)
 
     def again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
-        trials = iter(self._trials)
+        trials, dtype = iter(self._trials), start[0].dtype
 
         def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
             way, solved = next(trials)
             return followed(trial, state, held, way)[0], solved
 
-        return simulator.with_attempt(attempt).started(*start, control)
+        wide, held = simulator.precise().with_attempt(attempt), None if control is None else control.double()
+        q, v = (x.double() for x in start)
+        begin: S = in_dtype(wide.started(q, v, held), dtype)
+        return begin
 
 
 def _constant(state: S, worlds: Tensor) -> S:
@@ -209,11 +212,10 @@ def _constant(state: S, worlds: Tensor) -> S:
     return result
 
 
-def complain(policy: Doubtful, doubts: Tensor, singular: Tensor, time: Tensor) -> Tensor:
-    """The doubts `[*batch]` with those of singular steps; raises `GradientError` or warns where the policy says so."""
-    doubts = doubts | int(Doubt.SINGULAR) * plain(singular).int()
+def complain(policy: Doubtful, doubts: Tensor, time: Tensor) -> None:
+    """Raises `GradientError` or warns where the doubts `[*batch]` are such that the policy says so."""
     if policy is Doubtful.ZERO:
-        return doubts
+        return
     for doubt in (Doubt.UNSOLVED, Doubt.SINGULAR):
         worlds = ((doubts & int(doubt)) > 0).reshape(-1)
         if not bool(worlds.any()):
@@ -226,7 +228,6 @@ def complain(policy: Doubtful, doubts: Tensor, singular: Tensor, time: Tensor) -
         if policy is Doubtful.RAISE:
             raise GradientError(message)
         warnings.warn(message, GradientWarning, stacklevel=2)
-    return doubts
 
 
 def _pushed(function: _Function, values: list[Tensor], change: list[Tensor]) -> Sequence[Tensor]:
@@ -275,8 +276,11 @@ class _Implicit(torch.autograd.Function):
         ctx.set_materialize_grads(False)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: _Context, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():  # as with create_graph=True, and in torch.func's backward transforms
+            raise GradientError(
+                "steps have first derivatives only: use torch.autograd.grad without create_graph, or torch.func.jvp"
+            )
         needed = ctx.needs_input_grad[1:]
         with torch.enable_grad():
             values = [x.detach().requires_grad_(need) for x, need in zip(ctx.saved_tensors, needed, strict=True)]

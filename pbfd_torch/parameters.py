@@ -101,3 +101,8 @@ def mapped_tensors(structure: Any, function: Callable[[Tensor], Tensor]) -> Any:
         return structure if same else type(structure)(items)
     fields = {key: mapped_tensors(x, function) for key, x in _fields(structure)}
     return replaced(structure, **fields) if fields else structure
+
+
+def in_dtype(structure: Any, dtype: torch.dtype) -> Any:
+    """The same structure with its floating-point tensors in another type."""
+    return mapped_tensors(structure, lambda x: x.to(dtype) if x.is_floating_point() else x)

@@ -21,7 +21,7 @@ from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
 from pbfd_torch.linearization import Linearization, linearized
 from pbfd_torch.linked import Linked, carries
 from pbfd_torch.objective import BalanceObjective, blank_memory
-from pbfd_torch.parameters import tensors_of
+from pbfd_torch.parameters import in_dtype, tensors_of
 from pbfd_torch.recording import Recorder
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.scene import Scene
@@ -246,6 +246,16 @@ class Simulator(Generic[S]):
         other = copy.copy(self)
         other.scene = replaced(self.scene, articulation=parts.articulation, terms=parts.terms, gravity=parts.gravity)
         other.step_size, other._terms = parts.step_size, parts.adapted
+        return other
+
+    def precise(self) -> Simulator[S]:
+        """The same simulator in float64, itself if it is."""
+        if self.articulation.dtype == torch.float64:
+            return self
+        scene = self.scene
+        parts = Parts(scene.articulation, scene.terms, scene.gravity, self.step_size, self._terms)
+        other = self.of_parts(in_dtype(parts, torch.float64))
+        other._scale = self._scale.double()
         return other
 
     def with_attempt(self, attempt: Attempt) -> Simulator[S]:

@@ -139,6 +139,9 @@ class EnergyMomentum:
             flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
             turned = objective.turn(dt[..., None] * average)
             gained, energy = self._gain(objective, state, end, now, forces)
+            # what rounding has left of the residual works too: in float32 stiff friction is off by a share of the weight
+            if bool((gained > EXCESS * energy).any()):
+                gained = gained - dt * (objective.evaluate(q).residual * average).sum(-1)
             return (flat < FLATTEST) | (turned > FARTHEST) | (gained > EXCESS * energy)
 
         return end, refused
