@@ -1,4 +1,4 @@
-# `make demo`, `make test` and `make lint` each work from nothing: the first one to run creates .venv.
+# `make demo`, `make test`, `make lint` and `make notebooks` each work from nothing: the first one to run creates .venv.
 # Another interpreter: make test PYTHON=python3.12. Other pytest arguments: make test PYTEST_ARGS="-x tests/solvers".
 PYTHON ?= python3
 PYTEST_ARGS ?= -n 2
@@ -7,7 +7,7 @@ BIN := .venv/bin
 # One thread each: matrices are small, and the workers share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint format clean
+.PHONY: demo test lint format notebooks clean
 
 demo: .venv/.installed
 	$(BIN)/pbfd demo --out demo
@@ -28,6 +28,9 @@ format: .venv/.installed
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install -c constraints.txt -e '.[dev]'
 	touch $@
+
+notebooks: .venv/.installed
+	$(BIN)/jupytext --to ipynb notebooks/*.py
 
 clean:
 	rm -rf .venv build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -155,10 +155,11 @@ class Identification:
         from where the one before ended. progress: a bar on standard error."""
         x = self.start if starts is None else starts
         stopping = stopping or Stopping()
-        stages = [self.first(steps) for steps in horizons]
-        for stage in stages:
-            x = stage._fitted(x, stopping, progress).x
-        return Identified(self, self._fitted(x, stopping, progress))
+        fits: list[Fit] = []
+        for stage in [*(self.first(steps) for steps in horizons), self]:
+            fits.append(stage._fitted(x, stopping, progress))
+            x = fits[-1].x
+        return Identified(self, fits[-1], tuple(fits[:-1]))
 
     def _fitted(self, x: Tensor, stopping: Stopping, progress: bool) -> Fit:
         with tqdm(total=stopping.iterations, desc=f"{self.experiment.measured.steps} steps", disable=not progress) as bar:
@@ -181,12 +182,19 @@ class Identification:
         return gaps
 
 
+def variances(fit: Fit) -> Tensor:
+    """‖r‖²/(m − n) at the start and after every iteration, `[k, *batch]`."""
+    rows, columns = fit.jacobian.shape[-2:]
+    return 2 * fit.history / max(rows - columns, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A finished identification of a batch of starts or of data sets."""
+    """A finished identification of a batch of starts or of data sets. `before`: the fits of shorter horizons that led to `fit`."""
 
     identification: Identification
     fit: Fit
+    before: tuple[Fit, ...] = ()
 
     @property
     def values(self) -> Tensor:
@@ -196,8 +204,7 @@ class Identified:
     @property
     def variance(self) -> Tensor:
         """‖r‖²/(m − n) `[*batch]`: 1 where simulation and noise are as they were said to be."""
-        rows, columns = self.fit.jacobian.shape[-2:]
-        return 2 * self.fit.cost / max(rows - columns, 1)
+        return variances(self.fit)[-1]
 
     @property
     def best(self) -> Identified:
@@ -221,6 +228,7 @@ class Identified:
                 outcome=fit.outcome.flatten()[k],
                 history=fit.history.flatten(1)[:, k],
             ),
+            self.before,
         )
 
     @property

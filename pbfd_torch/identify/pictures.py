@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from pbfd_torch.identify.identification import Identified
+from pbfd_torch.identify.identification import Identified, variances
 
 SIMULATED, MEASURED = "#d94801", "#08519c"
 
@@ -38,14 +38,19 @@ def draw_residuals(axes: Axes, found: Identified) -> None:
 
 
 def draw_cost(axes: Axes, found: Identified) -> None:
-    """The cost of every start over the iterations, with what the noise alone would leave."""
-    history = found.fit.history.flatten(1) if found.fit.history.ndim > 1 else found.fit.history[:, None]
-    axes.plot(history, color=MEASURED, alpha=0.6, linewidth=1.2)
-    rows, columns = found.fit.jacobian.shape[-2:]
-    axes.axhline(0.5 * (rows - columns), color=SIMULATED, linestyle="--", label="the noise alone")
+    """How the residual's variance fell from every start, over the iterations of all horizons; 1 is what the noise alone leaves."""
+    begin = 0
+    for k, fit in enumerate((*found.before, found.fit)):
+        history = variances(fit).reshape(len(fit.history), -1)
+        steps = range(begin, begin + len(history))
+        axes.plot(steps, history, "-o", color=MEASURED, alpha=0.6, linewidth=1.2, markersize=3)
+        if k > 0:
+            axes.axvline(begin - 0.5, color="0.7", linewidth=1, label="longer horizon" if k == 1 else "_")
+        begin += len(history)
+    axes.axhline(1.0, color=SIMULATED, linestyle="--", label="the noise alone")
     axes.set_yscale("log")
-    axes.set_xlabel("iteration")
-    axes.set_ylabel("cost ½‖r‖²")
+    axes.set_xlabel("evaluation")
+    axes.set_ylabel("‖r‖² / (m − n)")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
 
