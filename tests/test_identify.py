@@ -90,6 +90,29 @@ def test_arm() -> None:
     assert "!" not in text
 
 
+def test_what_scales_together() -> None:
+    """An arm with twice the masses, damping and gain moves the same: data do not tell that factor, and the report says so."""
+    experiment, truth = arm_experiment(sets=(), noise=0.01)
+    found = Identification(experiment, [Mass("upper"), Mass("fore"), *ARM]).fit(horizons=(10,), stopping=QUICK)
+    known = found.certainty
+    assert len(known.loose) == 1
+    assert not bool(known.determined[:2].any())
+    ratios = found.values[2:] / found.values[1]
+    assert float(ratios[2]) == pytest.approx(float(truth[2]), rel=0.05)
+    assert "! the data do not determine the combination" in report(found)
+
+
+def test_bounds_are_reported() -> None:
+    experiment, _ = arm_experiment(sets=(), noise=0.01)
+    gain = Parameter("servo gain", (GAIN, STIFFNESS), lower=0.0, upper=6.0)
+    found = Identification(experiment, [*ARM[:2], gain]).fit(horizons=(10,), stopping=QUICK)
+    assert float(found.values[2]) == 6
+    text = report(found)
+    assert "! servo gain is at its bound" in text
+    assert "held" in text.splitlines()[3]
+    assert "larger than the stated noise" in text
+
+
 def test_where_an_arm_started() -> None:
     """The same when nobody looked how the runs began, seen by markers of which one is hidden for a while."""
     experiment, truth = arm_experiment(sets=(), noise=1e-12)

@@ -207,6 +207,11 @@ class Identified:
         return variances(self.fit)[-1]
 
     @property
+    def unsolved(self) -> Tensor:
+        """How many steps of the simulation at the answer were not solved, of all runs, `[*batch]`: derivatives end there."""
+        return self.identification.experiment.simulated(self.identification.case(self.fit.x))[1]
+
+    @property
     def best(self) -> Identified:
         """The fit of the lowest cost, as one that is no batch."""
         fit = self.fit

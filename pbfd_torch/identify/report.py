@@ -31,7 +31,8 @@ def report(found: Identified) -> str:
     for k, quantity in enumerate(quantities):
         remark = "" if bool(known.determined[k]) else "not determined"
         digits = 5 if not math.isfinite(deviations[k]) or deviations[k] == 0 else _digits(values[k], deviations[k])
-        rows.append((quantity.name, f"{values[k]:.{digits}g}", f"{deviations[k]:.2g}", quantity.unit, remark))
+        deviation = f"{deviations[k]:.2g}" if deviations[k] > 0 else "held"
+        rows.append((quantity.name, f"{values[k]:.{digits}g}", deviation, quantity.unit, remark))
     widths = [max(len(row[c]) for row in rows) for c in range(4)]
     lines = [
         f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]:>{widths[2]}}  {row[3]:<{widths[3]}}  {row[4]}".rstrip()
@@ -52,6 +53,8 @@ def _warnings(found: Identified, one: Identified, known: Certainty) -> list[str]
     lines = []
     if float(one.variance) > MISFIT:
         lines.append("! the residual is larger than the stated noise: the simulation lacks something, or the fit is no global one")
+    if int(one.unsolved) > 0:
+        lines.append(f"! {int(one.unsolved)} steps of the simulation are unsolved")
     labels = one.identification.labels
     lines += [f"! the data do not determine {_combination(direction.tolist(), labels)}" for direction in known.loose]
     lines += [f"! {name} is at its bound" for k, name in enumerate(labels) if bool(one.fit.held[k])]
