@@ -1,0 +1,118 @@
+"""`box-throw`: a box is thrown so that it lands, slides and comes to rest at a target: with what velocity?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.shapes import Collider, Sphere
+from pbfd_torch.errors import InputError
+from pbfd_torch.identify.levenberg_marquardt import Bounds, Stopping
+from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.integrators.energy_momentum import Velocities
+from pbfd_torch.optimize.decision import StartVelocity
+from pbfd_torch.optimize.shooting import Progress, Shooting
+from pbfd_torch.optimize.tasks.task import Outcome
+from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.trajectory import Trajectory
+
+HALF = (0.1, 0.1, 0.05)  # half extents [m]
+RADIUS = 0.01  # of the sphere at each corner [m]
+FRICTION = 0.4
+STIFFNESS = 1e6  # C⊥ [N/m²]
+HEIGHT = 0.4  # of the centre at the start [m]
+TARGET = (1.5, 0.5)  # [m]
+NEAR, SLOW = 0.01, 0.01  # [m], [m/s or rad/s] at the end
+FAST = 5.0  # bounds of the velocity [m/s]
+LEAST, MOST = (0.5, -1.5, -1.0), (3.0, 1.5, 1.5)  # velocities of the random starts [m/s]
+SPIN = 4.0  # about the vertical, to both sides, at most [rad/s]
+DT, STEPS = 0.025, 60
+
+
+def _scene(dtype: torch.dtype, device: torch.device | str) -> Scene:
+    x, y, z = (h * h / 3 for h in HALF)
+    rows = ((y + z, 0.0, 0.0), (0.0, x + z, 0.0), (0.0, 0.0, x + y))
+    link = Link("box", joints=(Joint("free", JointKind.FREE),), mass=1.0, inertia=rows)
+    articulation = Articulation.from_links([link], dtype, device)
+    places = [(x, y, z) for x in (-HALF[0], HALF[0]) for y in (-HALF[1], HALF[1]) for z in (-HALF[2], HALF[2])]
+    corners = [Collider(f"corner{k}", "box", Sphere(RADIUS), place) for k, place in enumerate(places)]
+    ground = HalfSpace()
+    contact = Contact.between(articulation, corners, ground, NormalForce(STIFFNESS), CoulombFriction(FRICTION))
+    gravity = torch.tensor([0.0, 0.0, -9.81], dtype=dtype, device=device)
+    return Scene(articulation, (Inertia(), contact), gravity, corners, (ground,), "box-throw")
+
+
+@dataclass(frozen=True)
+class BoxThrow:
+    """Gauss–Newton from random throws, each with a random spin that stays as it is. `worlds` ≥ 1; `seed` of the starts."""
+
+    worlds: int = 20
+    seed: int = 0
+    dtype: torch.dtype = torch.float64
+    device: torch.device | str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.worlds < 1:
+            raise InputError(f"worlds is {self.worlds}: must be ≥ 1")
+
+    @property
+    def criterion(self) -> str:
+        """See `Task`."""
+        return f"the box within {100 * NEAR:g} cm of the target, at rest ({SLOW:g} m/s, {SLOW:g} rad/s)"
+
+    @property
+    def iterations(self) -> int:
+        """See `Task`."""
+        return 30
+
+    @property
+    def shooting(self) -> Shooting[Velocities]:
+        """What moves: 1.5 s at steps of 25 ms."""
+        simulator: Simulator[Velocities] = Simulator(
+            _scene(self.dtype, self.device), DT, gradients=Gradients(doubtful=Doubtful.ZERO)
+        )
+        q = simulator.articulation.rest.clone()
+        q[2] = HEIGHT
+        v = q.new_zeros(self.worlds, 6)
+        v[:, 5] = SPIN * (2 * self._random[:, 3] - 1)
+        most = q.new_full((3,), FAST)
+        return Shooting(simulator, StartVelocity(simulator, STEPS, q, v, (0, 1, 2), Bounds(-most, most, 0.2 * most)))
+
+    @property
+    def _random(self) -> Tensor:
+        """Uniform in 0 … 1, `[worlds, 4]`, the same for every call."""
+        generator = torch.Generator().manual_seed(self.seed)
+        return torch.rand(self.worlds, 4, dtype=torch.float64, generator=generator).to(self.device, self.dtype)
+
+    @property
+    def starts(self) -> Tensor:
+        """Velocities of the random throws `[worlds, 3]`."""
+        least, most = (torch.tensor(x, dtype=self.dtype, device=self.device) for x in (LEAST, MOST))
+        return least + (most - least) * self._random[:, :3]
+
+    def residual(self, motion: Trajectory[Velocities], controls: Tensor | None) -> Tensor:
+        """How far the box is from the target at the end, and how fast, in units of the criterion `[*batch, 4]`."""
+        gap = motion.q[-1, ..., :2] - motion.q.new_tensor(TARGET)
+        return torch.cat((gap / NEAR, motion.v[-1, ..., :2] / (10 * SLOW)), -1)
+
+    def reached(self, motion: Trajectory[Velocities]) -> Tensor:
+        """`[*batch]` bool."""
+        gap = motion.q[-1, ..., :2] - motion.q.new_tensor(TARGET)
+        still = (motion.v[-1].abs() < SLOW).all(-1)
+        return (torch.linalg.vector_norm(gap, dim=-1) < NEAR) & still & motion.solved.all(0)
+
+    def solve(self, iterations: int, progress: Progress | None = None) -> Outcome[Velocities]:
+        """See `Task`."""
+        shooting, x = self.shooting, self.starts
+        shot = shooting.gauss_newton(self.residual, x, Stopping(iterations), progress)
+        before, reached = shooting.decision.plan(x), self.reached(shot.trajectory)
+        return Outcome(shooting.simulator, before, shot.plan, shot.history, reached, shot.unsolved, shot.doubtful)
