@@ -27,7 +27,12 @@ def armature_diagonal(articulation: Articulation, terms: Sequence[Term]) -> Tens
 
 def mass_matrix(articulation: Articulation, q: Tensor, terms: Sequence[Term] = ()) -> Tensor:
     """Joint-space mass matrix M(q) `[*batch, nv, nv]`; `terms` may hold armatures, which add to its diagonal."""
-    placement = place(articulation, q)
+    return mass_matrix_at(place(articulation, q), terms)
+
+
+def mass_matrix_at(placement: Placement, terms: Sequence[Term] = ()) -> Tensor:
+    """The same of an articulation that is placed already."""
+    articulation = placement.articulation
     second = placement.poses @ articulation.pseudo_inertia @ placement.poses.mT
     still = torch.zeros_like(second[..., :3, :])
     inertia = Balance(placement, [LinkLoad(still, lambda: inertia_stiffness(second))]).stiffness

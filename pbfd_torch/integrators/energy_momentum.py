@@ -23,7 +23,14 @@ from torch import Tensor
 
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.assembly import Balance
-from pbfd_torch.dynamics import armature_diagonal, generalised_momentum, kinetic_energy, mass_matrix, potential_energy, rotor_energy
+from pbfd_torch.dynamics import (
+    armature_diagonal,
+    generalised_momentum,
+    kinetic_energy,
+    mass_matrix_at,
+    potential_energy,
+    rotor_energy,
+)
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, calm, fall, fresh
@@ -88,7 +95,7 @@ class EnergyMomentum:
         forces = _Forces(objective, place(stepper.articulation, trial.end))
         at = objective.step.previous
         impulse, given = dt[..., None] * forces.rough, dt[..., None] * forces.smooth
-        inertia = mass_matrix(objective.articulation, q, objective.terms)
+        inertia = mass_matrix_at(at, objective.terms)
         gained = dt[..., None] * trial.acceleration
         (push,) = _solved(inertia, impulse)
         push = torch.where((trial.solved & calm(objective, at, push))[..., None], push, nothing)
@@ -236,7 +243,7 @@ def _ended(
     """The state at a placement with that momentum."""
     h = objective.step.dt[..., None]
     impulse = h * forces.rough
-    inertia = mass_matrix(objective.articulation, now.q, objective.terms)
+    inertia = mass_matrix_at(now, objective.terms)
     v, push = _solved(inertia, momentum, impulse)
     # ⟨p, M p'⟩ / ⟨p, M p⟩ is how much of this push p the last one p' was
     kept, whole = (impulse * state.push).sum(-1), (impulse * push).sum(-1)
