@@ -1,29 +1,43 @@
 """Differentiable, modular simulation of articulated bodies with frictional contact, stable at large time steps."""
 
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
-from pbfd_torch.errors import InputError, ModelError, NotModelledWarning, PbfdError
+from pbfd_torch.contact_jacobians import ContactJacobian, contact_jacobians
+from pbfd_torch.errors import GradientError, GradientWarning, InputError, ModelError, NotModelledWarning, PbfdError
+from pbfd_torch.implicit import Blur, Doubt, Doubtful, Gradients
 from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.variational import Variational
+from pbfd_torch.linearization import Chart, Linearization
+from pbfd_torch.parameters import parameters, with_parameters
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution, Status
+from pbfd_torch.trajectory import Trajectory
 
 __all__ = [
     "Articulation",
     "Bdf2",
+    "Blur",
+    "Chart",
+    "ContactJacobian",
     "Descent",
+    "Doubt",
+    "Doubtful",
     "EnergyMomentum",
     "Fallbacks",
+    "GradientError",
+    "GradientWarning",
+    "Gradients",
     "ImplicitEuler",
     "InputError",
     "Joint",
     "JointKind",
+    "Linearization",
     "Link",
     "ModelError",
     "NotModelledWarning",
@@ -34,5 +48,9 @@ __all__ = [
     "Solution",
     "State",
     "Status",
+    "Trajectory",
     "Variational",
+    "contact_jacobians",
+    "parameters",
+    "with_parameters",
 ]

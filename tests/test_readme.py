@@ -12,13 +12,15 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The Python block prints solved steps and writes the rollout that it names."""
-    (example,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    """The Python blocks print solved steps, write the rollout that they name, and print the derivative that they say."""
+    example, derivative = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.strip().splitlines()) <= 16
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "README.md", "exec"), {})
     assert re.search(r"100\.0% of the steps solved", capsys.readouterr().out)
     assert (tmp_path / "hopper.npz").stat().st_size > 10_000
+    exec(compile(derivative, "README.md", "exec"), {})
+    assert "slides 0.1699 m, by μ -0.5678 m" in capsys.readouterr().out
 
 
 def test_the_two_commands_are_in_the_makefile() -> None:
