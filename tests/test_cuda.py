@@ -102,3 +102,18 @@ def test_a_round_as_a_graph(solver: Descent) -> None:
         torch.cuda.synchronize()
     for found, expected in zip(tensors(recorded), tensors(eager), strict=True):
         assert torch.equal(found.nan_to_num(), expected.nan_to_num())
+
+
+# Derivatives ----------------------------------------------------------------------------------------------------------
+
+
+def test_cuda_derivatives_agree_with_cpu() -> None:
+    """The derivative of a landing by its start velocity is the same on both devices, to 1e-6 of the largest entry."""
+    found = []
+    for device in ("cpu", "cuda"):
+        setup = SCENES["chain-slope-drop"](worlds=2, device=device)
+        simulator = Simulator(setup.scene, 0.02)
+        v = setup.v.clone().requires_grad_()
+        path = simulator.trajectory(simulator.initial_state(setup.q, v), steps=8)
+        found.append(torch.autograd.grad(path.q[-1].sum(), v)[0].cpu())
+    assert float((found[0] - found[1]).abs().max()) <= 1e-6 * float(found[0].abs().max())
