@@ -105,15 +105,15 @@ def test_limits_and_held_controls() -> None:
 def test_a_start_velocity_is_found() -> None:
     """A sliding box, μ = .1, .2, .3, is to come to rest after .4 m: v² = 2 μ g d, but for what the last step takes."""
     setup = SCENES["box-slide"](worlds=3)
-    simulator = Simulator(setup.scene, 0.03)
+    simulator = Simulator(setup.scene, 0.05)
     most = torch.tensor([5.0], dtype=torch.float64)
-    decision = StartVelocity(simulator, 34, setup.q, torch.zeros_like(setup.v), (0,), Bounds(-most, most, most))
+    decision = StartVelocity(simulator, 20, setup.q, torch.zeros_like(setup.v), (0,), Bounds(-most, most, most))
     shot = Shooting(simulator, decision).gauss_newton(
         lambda motion, _: motion.q[-1, ..., :1] - motion.q[0, ..., :1] - 0.4, torch.ones(3, 1, dtype=torch.float64), Stopping(6)
     )
     wanted = [math.sqrt(2 * mu * 9.81 * 0.4) for mu in (0.1, 0.2, 0.3)]
     assert bool((shot.cost < 1e-8).all())
-    assert shot.x[:, 0].tolist() == pytest.approx(wanted, rel=0.03)
+    assert shot.x[:, 0].tolist() == pytest.approx(wanted, rel=0.05)
 
 
 def test_unsolved_steps_are_not_silent() -> None:

@@ -35,7 +35,7 @@ NEAR, SLOW = 0.01, 0.01  # [m], [m/s or rad/s] at the end
 FAST = 4.0  # bounds of the horizontal velocity [m/s]
 LEAST, MOST = (0.5, -1.0, -1.0), (3.0, 1.0, 1.0)  # velocities of the random starts [m/s]
 SPIN = 4.0  # about the vertical, to both sides, at most [rad/s]
-DT, STEPS = 0.03, 40
+DT, STEPS = 0.04, 30
 
 
 def _scene(dtype: torch.dtype, device: torch.device | str) -> Scene:
@@ -77,7 +77,7 @@ class BoxThrow:
 
     @property
     def shooting(self) -> Shooting[Velocities]:
-        """What moves: 1.2 s at steps of 30 ms."""
+        """What moves: 1.2 s at steps of 40 ms."""
         simulator: Simulator[Velocities] = Simulator(
             _scene(self.dtype, self.device), DT, gradients=Gradients(doubtful=Doubtful.ZERO)
         )
