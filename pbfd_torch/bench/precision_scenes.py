@@ -13,6 +13,8 @@ from pbfd_torch.bench.precision_reference import chain_tips, middle_axes
 from pbfd_torch.bench.precision_tracks import Track, rms
 from pbfd_torch.models import SCENES, Setup, boxes, chains
 
+HELD = 0.02  # [s] for which a control is held
+
 
 @dataclass(frozen=True)
 class Case:
@@ -53,16 +55,20 @@ class Case:
 
     @property
     def frame(self) -> float:
-        """The longest step of the adaptive runs [s]; a control is held for it."""
-        return 0.1 if self.control is None else 0.01
+        """The longest step of the adaptive runs [s]."""
+        return 0.1 if self.control is None else HELD
 
     def setup(self, worlds: int) -> Setup:
         """The scene, world k like world k modulo `tracked_worlds`."""
         return SCENES[self.scene](worlds=worlds)
 
     def controls(self, dt: float, start: Tensor) -> Tensor | None:
-        """`[*, nu]` held over the steps of length dt that begin at the times `[*]`: as it is in their middle."""
-        return None if self.control is None else self.control(start + 0.5 * dt)
+        """`[*, nu]` of the steps of length dt that begin at the times `[*]`. It is held for `HELD`, as it is in the middle of that,
+        so that all steps that are no longer see the same control."""
+        if self.control is None:
+            return None
+        held = max(HELD, dt)
+        return self.control(held * (torch.floor((start + 0.5 * dt) / held) + 0.5))
 
     def error(self, track: Track, reference: Tensor) -> float:
         """In `unit`; NaN where the motion is not finite."""
