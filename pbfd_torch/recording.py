@@ -20,60 +20,49 @@ if TYPE_CHECKING:
     from pbfd_torch.scene import Scene
 
 
-class Recorder:
-    """Collects one entry per step; `finish` stacks them."""
+class Records:
+    """One entry per step and quantity; `finish` stacks them."""
 
-    def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, state: State) -> None:
-        self._scene, self._integrator, self._dt = scene, integrator, dt
+    def __init__(self, scene: Scene, dt: float) -> None:
+        self._scene, self._dt = scene, dt
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0
         self._lanes = 0
-        self._add(**self._state(state, place(scene.articulation, state.q)))
 
-    def _add(self, **entries: Tensor) -> None:
-        for name, value in entries.items():
-            self._entries.setdefault(name, []).append(value)
+    def _begin(self, start: dict[str, Tensor]) -> None:
+        """The state at the start."""
+        for name, value in start.items():
+            self._entries[name] = [value]
 
-    def _state(self, state: State, placement: Placement) -> dict[str, Tensor]:
-        scene = self._scene
-        a = scene.articulation
-        dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
-        v = self._integrator.velocity(a, state, dt)
-        rates = self._integrator.pose_rates(a, state, dt)
-        linear, angular = momentum(placement, rates)
-        return {
-            "q": state.q,
-            "v": v,
-            "link_poses": placement.poses[..., :3, :],
-            "center_of_mass": center_of_mass(placement),
-            "kinetic_energy": kinetic_energy(a, rates) + rotor_energy(a, v, scene.terms),
-            "potential_energy": scene.potential_energy(placement, state.time),
-            "linear_momentum": linear,
-            "angular_momentum": angular,
-        }
-
-    def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
-        """One solved step: the state after it, how it was solved, and its contacts."""
-        placement = place(self._scene.articulation, state.q)
-        entries = self._state(state, placement) | {
+    def _add(self, solution: Solution, entries: dict[str, Tensor]) -> None:
+        """One step, all at once: an interruption before this leaves the record as it was."""
+        solved = {
             "status": solution.status,
             "iterations": solution.iterations,
             "evaluations": solution.evaluations,
             "residual_norm": solution.residual_norm,
             "fallbacks": solution.fallbacks,
-            "hazards": state.hazards,
             "substeps": torch.ones_like(solution.status) if solution.steps is None else solution.steps,
         }
-        pairs = zip(objective.terms, objective.prepared, strict=True)
-        contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]
-        points = [term.points(prepared, placement) for term, prepared in contacts]
-        if points:
-            entries["contact_point"] = torch.cat([x.point for x in points], -2)
-            entries["contact_depth"] = torch.cat([x.depth for x in points], -1)
-            entries["contact_force"] = torch.cat([x.force for x in points], -2)
-        self._add(**entries)  # all at once, at the end: an interruption before this leaves the record as it was
+        for name, value in (entries | solved).items():
+            self._entries.setdefault(name, []).append(value)
         self.steps += 1
         self._lanes += solution.lanes
+
+    def _seen(self, placement: Placement, v: Tensor, rates: Tensor, stored: Tensor) -> dict[str, Tensor]:
+        """A state: placement and velocity v `[*batch, nv]`, the links' rates, and the potential energy [J] `[*batch]`."""
+        scene = self._scene
+        linear, angular = momentum(placement, rates)
+        return {
+            "q": placement.q,
+            "v": v,
+            "link_poses": placement.poses[..., :3, :],
+            "center_of_mass": center_of_mass(placement),
+            "kinetic_energy": kinetic_energy(scene.articulation, rates) + rotor_energy(scene.articulation, v, scene.terms),
+            "potential_energy": stored,
+            "linear_momentum": linear,
+            "angular_momentum": angular,
+        }
 
     def finish(self, lanes: int | None = None) -> Rollout:
         """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
@@ -92,6 +81,36 @@ class Recorder:
             time=self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device),
             **stacked,
         )
+
+
+class Recorder(Records):
+    """The record of a `Simulator`."""
+
+    def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, state: State) -> None:
+        super().__init__(scene, dt)
+        self._integrator = integrator
+        self._begin(self._state(state, place(scene.articulation, state.q)))
+
+    def _state(self, state: State, placement: Placement) -> dict[str, Tensor]:
+        scene = self._scene
+        a = scene.articulation
+        dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
+        v = self._integrator.velocity(a, state, dt)
+        rates = self._integrator.pose_rates(a, state, dt)
+        return self._seen(placement, v, rates, scene.potential_energy(placement, state.time))
+
+    def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
+        """One solved step: the state after it, how it was solved, and its contacts."""
+        placement = place(self._scene.articulation, state.q)
+        entries = self._state(state, placement) | {"hazards": state.hazards}
+        pairs = zip(objective.terms, objective.prepared, strict=True)
+        contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]
+        points = [term.points(prepared, placement) for term, prepared in contacts]
+        if points:
+            entries["contact_point"] = torch.cat([x.point for x in points], -2)
+            entries["contact_depth"] = torch.cat([x.depth for x in points], -1)
+            entries["contact_force"] = torch.cat([x.force for x in points], -2)
+        self._add(solution, entries)
 
 
 def _alike(values: list[Tensor]) -> list[Tensor]:
