@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from pbfd_torch.appearance import Visual
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Collider, Sphere
+from pbfd_torch.contact.shapes import Box, Collider, Sphere
+from pbfd_torch.depiction import link_color, visual_of
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.scene import Scene
@@ -33,6 +36,12 @@ def _box_link(name: str) -> Link:
     return Link(name, joints=(Joint(f"{name}_free", JointKind.FREE),), mass=1.0, inertia=rows)
 
 
+def box_visuals(count: int = 1) -> list[Visual]:
+    """Every box with the skin that its corners' spheres give it."""
+    skinned = Box((HALF[0] + RADIUS, HALF[1] + RADIUS, HALF[2] + RADIUS))
+    return [visual_of(f"box{k}", k, skinned, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), link_color(k)) for k in range(count)]
+
+
 def _corners(name: str) -> list[Collider]:
     places = [(x, y, z) for x in (-HALF[0], HALF[0]) for y in (-HALF[1], HALF[1]) for z in (-HALF[2], HALF[2])]
     return [Collider(f"{name}_{k}", name, Sphere(RADIUS), place) for k, place in enumerate(places)]
@@ -46,7 +55,9 @@ def _scene(names: list[str], mu: Tensor, slope: float, title: str, dtype: torch.
         articulation, colliders, ground, NormalForce(STIFFNESS), CoulombFriction(mu.to(device, dtype)[:, None])
     )
     gravity = torch.tensor([GRAVITY * math.sin(slope), 0.0, -GRAVITY * math.cos(slope)], dtype=dtype, device=device)
-    return Scene(articulation, (Inertia(), contact), gravity, colliders, (ground,), title)
+    return Scene(
+        articulation, (Inertia(), contact), gravity, colliders, (ground,), title, functools.partial(box_visuals, len(names))
+    )
 
 
 def _resting_height(slope: float) -> float:

@@ -12,9 +12,11 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
+from pbfd_torch.appearance import Visual
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Collider, Point
+from pbfd_torch.contact.shapes import Capsule, Collider, Point
+from pbfd_torch.depiction import link_color, visual_of
 from pbfd_torch.dynamics import momentum
 from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models.setup import Metric, Setup, repeated, tilted
@@ -68,6 +70,13 @@ def chain_colliders(count: int = 10, points: int = 2) -> list[Collider]:
     ]
 
 
+def chain_visuals(count: int = 10) -> list[Visual]:
+    """Every link as the capsule that its points stand for."""
+    rod, middle = Capsule(RADIUS, LENGTH / 2), (LENGTH / 2, 0.0, 0.0)
+    along_x = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+    return [visual_of(f"link{k}", k, rod, middle, along_x, link_color(k)) for k in range(count)]
+
+
 def _scene(
     title: str, dtype: torch.dtype, device: torch.device | str, *, free: bool, mu: float | None, slope: float = 0.0,
     gravity: float = GRAVITY, last_mass: float = MASS, stiffness: float = STIFFNESS, points: int = 2,
@@ -80,7 +89,7 @@ def _scene(
         colliders, obstacles = chain_colliders(points=points), (HalfSpace(),)
         terms.append(Contact.between(articulation, colliders, obstacles[0], NormalForce(stiffness), CoulombFriction(mu)))
     down = torch.tensor([gravity * math.sin(slope), 0.0, -gravity * math.cos(slope)], dtype=dtype, device=device)
-    return Scene(articulation, tuple(terms), down, colliders, obstacles, title)
+    return Scene(articulation, tuple(terms), down, colliders, obstacles, title, chain_visuals)
 
 
 def _placed(scene: Scene, worlds: int, pitch: float, clearance: float) -> Tensor:

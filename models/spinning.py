@@ -6,7 +6,10 @@ from collections.abc import Mapping
 
 import torch
 
+from pbfd_torch.appearance import Visual
 from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.contact.shapes import Box
+from pbfd_torch.depiction import link_color, visual_of
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.scene import Scene
@@ -20,6 +23,15 @@ def _bar(mass: float, half: tuple[float, float, float], x: float) -> torch.Tenso
     return torch.trace(second) * torch.eye(3, dtype=torch.float64) - second
 
 
+def bar_visuals() -> list[Visual]:
+    """The two bars in the body's axes: its x is that of the bar across, its y that of the bar along."""
+    across, along, straight = Box((0.3, 0.05, 0.05)), Box((0.05, 0.15, 0.05)), (1.0, 0.0, 0.0, 0.0)
+    return [
+        visual_of("across", 0, across, (0.0, -0.1, 0.0), straight, link_color(0)),
+        visual_of("along", 0, along, (0.0, 0.1, 0.0), straight, link_color(1)),
+    ]
+
+
 def dzhanibekov(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
     """Two bars in the shape of a T, 20 rad/s about the middle axis with a small disturbance, no gravity."""
     mass = 0.5
@@ -30,7 +42,7 @@ def dzhanibekov(worlds: int = 1, dtype: torch.dtype = torch.float64, device: tor
     rows = ((first, 0.0, 0.0), (0.0, middle, 0.0), (0.0, 0.0, last))
     link = Link("body", joints=(Joint("free", JointKind.FREE),), mass=2 * mass, inertia=rows)
     articulation = Articulation.from_links([link], dtype, device)
-    scene = Scene(articulation, (Inertia(),), torch.zeros(3, dtype=dtype, device=device), name="dzhanibekov")
+    scene = Scene(articulation, (Inertia(),), torch.zeros(3, dtype=dtype, device=device), name="dzhanibekov", visuals=bar_visuals)
     q = repeated(articulation.rest, worlds)
     v = q.new_zeros(worlds, 6)
     v[:, 3], v[:, 4] = 0.01, 20.0

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.depiction import depicted
 from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
 from pbfd_torch.integrators.integrator import Integrator, State
 from pbfd_torch.kinematics import Placement, place
@@ -70,17 +71,32 @@ class Records:
         like = stacked["q"]
         if "contact_depth" not in stacked:
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
-            stacked |= {"contact_point": empty[..., None].expand(*empty.shape, 3), "contact_depth": empty}
-            stacked["contact_force"] = stacked["contact_point"]
+            stacked |= dict.fromkeys(_CONTACT, empty[..., None].expand(*empty.shape, 3)) | {"contact_depth": empty}
+        time = self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device)
         return Rollout(
             scene_name=self._scene.name,
             dt=self._dt,
             link_names=self._scene.articulation.link_names,
             joint_names=self._scene.articulation.joint_names,
             lanes=torch.tensor(self._lanes if lanes is None else lanes),
-            time=self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device),
+            appearance=depicted(self._scene),
+            time=time,
+            obstacle_poses=self._obstacle_poses(time, like.shape[1:-1]),
             **stacked,
         )
+
+    def _obstacle_poses(self, time: Tensor, batch: torch.Size) -> Tensor:
+        """See `Rollout`."""
+        a, obstacles = self._scene.articulation, self._scene.obstacles
+        moves = any(x.motion.moves for x in obstacles)
+        shape = (len(time) if moves else 1, *batch)
+        when = (time if moves else time[:1]).reshape(-1, *(1 for _ in batch)).expand(shape)
+        poses = [time.new_zeros((*shape, 0, 3, 4))]
+        for obstacle in obstacles:
+            carrier = obstacle.carrier(a.dtype, a.device)
+            pose = torch.eye(4, dtype=a.dtype, device=a.device) if carrier is None else carrier.pose(when)
+            poses.append(pose[..., None, :3, :].expand(*shape, 1, 3, 4))
+        return torch.cat(poses, -3)
 
 
 class Recorder(Records):
@@ -107,10 +123,13 @@ class Recorder(Records):
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]
         points = [term.points(prepared, placement) for term, prepared in contacts]
         if points:
-            entries["contact_point"] = torch.cat([x.point for x in points], -2)
             entries["contact_depth"] = torch.cat([x.depth for x in points], -1)
-            entries["contact_force"] = torch.cat([x.force for x in points], -2)
+            for name in _CONTACT:
+                entries[name] = torch.cat([getattr(x, name.removeprefix("contact_")) for x in points], -2)
         self._add(solution, entries)
+
+
+_CONTACT = ("contact_point", "contact_normal", "contact_force", "contact_slip")
 
 
 def _alike(values: list[Tensor]) -> list[Tensor]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -16,10 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pbfd_torch.appearance import Appearance, packed, unpacked
 from pbfd_torch.errors import InputError
-from pbfd_torch.solvers.objective import is_solved
+from pbfd_torch.solvers.objective import FALLBACKS, is_solved
 
-FORMAT = "pbfd_torch rollout 4"
+FORMAT = "pbfd_torch rollout 5"
+LARGEST = 2**35  # [bytes] of all arrays of a file together: what claims more is refused rather than read
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +32,14 @@ class Rollout:
 
     Attributes:
         scene_name, dt, link_names, joint_names: what was simulated, and the step [s].
+        appearance: what bodies and obstacles look like.
         time: `[T + 1]` [s].
         q: `[T + 1, *batch, nq]`.
         v: `[T + 1, *batch, nv]` average velocity over the step that ends at `time` (Eq. 3); entry 0 is that of the virtual
             step before the start, which differs from the given velocity by half a step's acceleration.
         link_poses: `[T + 1, *batch, nlink, 3, 4]` [R | t].
+        obstacle_poses: `[T + 1, *batch, nobstacle, 3, 4]` likewise, `[1, …]` where all of them stand still; of a plane: how it has
+            moved since time 0.
         center_of_mass: `[T + 1, *batch, 3]`.
         kinetic_energy, potential_energy: `[T + 1, *batch]` [J]; kinetic: of the average velocity, so half a step
             earlier than the potential one, which holds gravity, springs, limits and contacts.
@@ -42,18 +49,20 @@ class Rollout:
         hazards: `[T, *batch]` int, `Hazard` bits: what may be wrong with a step although it was solved.
         substeps: `[T, *batch]` int, steps that each world has made in it; 1 unless worlds choose their steps themselves.
         lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
-        contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_force:
-            `[T, *batch, npoint, 3]` on the body.
+        contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_normal, contact_force (on
+            the body) and contact_slip (tangential, over the step): `[T, *batch, npoint, 3]`.
     """
 
     scene_name: str
     dt: float
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
+    appearance: Appearance
     time: Tensor
     q: Tensor
     v: Tensor
     link_poses: Tensor
+    obstacle_poses: Tensor
     center_of_mass: Tensor
     kinetic_energy: Tensor
     potential_energy: Tensor
@@ -69,7 +78,9 @@ class Rollout:
     lanes: Tensor
     contact_point: Tensor
     contact_depth: Tensor
+    contact_normal: Tensor
     contact_force: Tensor
+    contact_slip: Tensor
 
     @property
     def steps(self) -> int:
@@ -101,9 +112,10 @@ class Rollout:
         """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all.
         Raises `InputError` where it cannot be written."""
         target = Path(path)
-        meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt}
+        words, surfaces = packed(self.appearance)
+        meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt, "appearance": words}
         meta |= {"link_names": list(self.link_names), "joint_names": list(self.joint_names)}
-        arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS}
+        arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS} | surfaces
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             # written beside the target and renamed: the folder goes with whatever an interruption leaves in it
@@ -116,23 +128,67 @@ class Rollout:
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Rollout:
-        """Reads what `save` wrote; never unpickles. Raises `InputError` for a missing, damaged or foreign file."""
+        """Reads what `save` wrote; never unpickles. Raises `InputError` for a file that is missing, damaged, foreign or of another
+        version, that claims more than 32 GiB, or whose arrays do not fit each other."""
         try:
             with np.load(path, allow_pickle=False) as file:
+                if not isinstance(file, np.lib.npyio.NpzFile):
+                    raise InputError(f"'{path}' is not a readable rollout: it is a single array")
+                packed_file: Any = file.zip
+                size = sum(entry.file_size for entry in packed_file.infolist())
+                if size > LARGEST:
+                    raise InputError(f"'{path}' claims {size / 2**30:.3g} GiB: must be at most {LARGEST / 2**30:.0f}")
                 meta = json.loads(str(file["meta"]))
                 if meta.get("format") != FORMAT:
                     raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
                 fields: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                 fields |= {name: tuple(map(str, meta[name])) for name in ("link_names", "joint_names")}
-                return Rollout(scene_name=str(meta["scene_name"]), dt=float(meta["dt"]), **fields)
+                surfaces = {name: file[name] for name in ("visual_vertices", "visual_faces")}
+            links = len(fields["link_names"])
+            seen = unpacked(meta["appearance"], surfaces, links, links + fields["obstacle_poses"].shape[-3])
+            rollout = Rollout(scene_name=str(meta["scene_name"]), dt=float(meta["dt"]), appearance=seen, **fields)
+            rollout.require_consistent()
         except FileNotFoundError as error:
             raise InputError(f"no rollout at '{path}'") from error
-        except InputError:
-            raise
+        except InputError as error:
+            raise InputError(str(error) if str(path) in str(error) else f"'{path}' is not a readable rollout: {error}") from error
         except _UNREADABLE as error:
-            raise InputError(f"'{path}' is not a readable rollout: {error}") from error
+            raise InputError(f"'{path}' is not a readable rollout: {type(error).__name__} {error}") from error
+        return rollout
+
+    def require_consistent(self) -> None:
+        """Raises `InputError` naming the first array whose shape or type does not fit the others."""
+        if self.q.ndim < 2 or len(self.q) < 2 or not (math.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"q has shape {tuple(self.q.shape)} and dt is {self.dt} s: must be [T + 1 ≥ 2, *batch, nq], and > 0")
+        batch, steps = tuple(self.q.shape[1:-1]), len(self.q) - 1
+        slots = self.contact_depth.shape[-1:]
+        states: dict[str, tuple[int, ...]] = {
+            "v": self.v.shape[-1:],
+            "link_poses": (len(self.link_names), 3, 4),
+            "center_of_mass": (3,),
+        }
+        states |= {"linear_momentum": (3,), "angular_momentum": (3,), "kinetic_energy": (), "potential_energy": ()}
+        solves: dict[str, tuple[int, ...]] = dict.fromkeys(
+            ("status", "iterations", "evaluations", "residual_norm", "hazards", "substeps"), ()
+        )
+        solves |= {"fallbacks": (len(FALLBACKS),), "contact_depth": slots}
+        solves |= {f"contact_{what}": (*slots, 3) for what in ("point", "normal", "force", "slip")}
+        expected = {name: (steps + 1, *batch, *shape) for name, shape in states.items()}
+        expected |= {name: (steps, *batch, *shape) for name, shape in solves.items()}
+        moving = len(self.obstacle_poses) if len(self.obstacle_poses) == 1 else steps + 1
+        expected |= {"time": (steps + 1,), "lanes": (), "obstacle_poses": (moving, *batch, *self.obstacle_poses.shape[-3:-2], 3, 4)}
+        for name, shape in expected.items():
+            value: Tensor = getattr(self, name)
+            if tuple(value.shape) != tuple(shape):
+                raise InputError(f"{name} has shape {tuple(value.shape)}: must be {tuple(shape)}")
+            if value.is_floating_point() == (name in _COUNTS):
+                raise InputError(f"{name} is {value.dtype}: must be {'integers' if name in _COUNTS else 'floating-point numbers'}")
 
 
 # what numpy and zipfile raise on damaged files, and what a foreign `meta` leads to
-_UNREADABLE = (OSError, ValueError, KeyError, AttributeError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (
+    OSError, ValueError, LookupError, AttributeError, TypeError, EOFError, RuntimeError, RecursionError, MemoryError,
+    zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
+)  # fmt: skip
 _ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]
+_COUNTS = {"status", "iterations", "evaluations", "fallbacks", "hazards", "substeps", "lanes"}

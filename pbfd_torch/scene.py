@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from pbfd_torch.appearance import Visual
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
@@ -31,6 +32,7 @@ class Scene:
         gravity: `[3]` or `[*batch, 3]` [m/s²].
         colliders, obstacles: geometry, for pictures and records; the contact terms hold what they need of it.
         name: for records.
+        visuals: gives what links look like, where that is not what touches; called when a record ends.
     """
 
     articulation: Articulation
@@ -39,6 +41,7 @@ class Scene:
     colliders: Sequence[Collider] = ()
     obstacles: Sequence[HalfSpace | Obstacle] = ()
     name: str = "scene"
+    visuals: Callable[[], Sequence[Visual]] = tuple
 
     def __post_init__(self) -> None:
         a = self.articulation

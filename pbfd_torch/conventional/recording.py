@@ -50,6 +50,8 @@ class Recorder(Records):
             "hazards": torch.zeros_like(solution.status),
             "contact_point": torch.cat([none, *(x.points for x in at)], -2),
             "contact_depth": torch.cat([none[..., 0], *(x.depth for x in at)], -1),
+            "contact_normal": torch.cat([none, *(x.normal for x in at)], -2),
             "contact_force": torch.cat([none, *(x.force for x in touched)], -2),
+            "contact_slip": torch.cat([none, *(x.slip for x in at)], -2),
         }
         self._add(solution, entries)

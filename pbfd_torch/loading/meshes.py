@@ -49,13 +49,14 @@ class HullLosses:
 def load_hull(file: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0), max_vertices: int = MAX_VERTICES) -> ReducedHull:
     """Convex hull of a mesh file (STL, OBJ, PLY, COLLADA) in metres, with at most `max_vertices` vertices. Of a COLLADA file the
     unit is applied and the up-axis is not, as everywhere in ROS. Raises `ModelError` for a file that holds no usable mesh."""
-    vertices = _read_vertices(file)
+    vertices: Points = np.asarray(read_mesh(file).vertices, np.float64)
     if not np.isfinite(vertices).all() or not np.isfinite(scale).all():
         raise ModelError(f"mesh '{file}': vertices and scale must be finite")
     return reduced_hull(vertices * np.array(scale), max_vertices, name=str(file))
 
 
-def _read_vertices(file: Path) -> Points:
+def read_mesh(file: Path) -> Any:
+    """All parts of a mesh file as one `trimesh.Trimesh` in metres; see `load_hull`."""
     import trimesh
 
     if file.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
@@ -63,15 +64,15 @@ def _read_vertices(file: Path) -> Points:
     try:
         scene: Any = trimesh.load_scene(file, process=False, skip_materials=True)
         parts = [
-            trimesh.transform_points(scene.geometry[name].vertices, matrix)
+            scene.geometry[name].copy().apply_transform(matrix)
             for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
         ]
     except Exception as error:  # trimesh raises whatever its readers raise
         raise ModelError(f"mesh '{file}' cannot be read: {error}") from error
-    if not sum(len(part) for part in parts):
+    if not sum(len(part.vertices) for part in parts):
         raise ModelError(f"mesh '{file}' holds no vertices")
-    vertices: Points = np.concatenate(parts).astype(np.float64)
-    return vertices * (_collada_unit(file) if file.suffix.lower() == ".dae" else 1.0)
+    whole: Any = trimesh.util.concatenate([trimesh.Trimesh(x.vertices, getattr(x, "faces", None), process=False) for x in parts])
+    return whole.apply_scale(_collada_unit(file)) if file.suffix.lower() == ".dae" else whole
 
 
 def _collada_unit(file: Path) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from pathlib import Path
@@ -17,6 +18,7 @@ from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
 from pbfd_torch.loading.mjcf_features import left_out
 from pbfd_torch.loading.mjcf_model import CompiledModel, compile_mjcf
+from pbfd_torch.loading.mjcf_visuals import mjcf_visuals
 from pbfd_torch.loading.report import naming, warn_not_modelled
 from pbfd_torch.loading.robot import Keyframe, Robot
 from pbfd_torch.terms.actuators import Actuators
@@ -47,6 +49,7 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
         obstacles=collisions.obstacles,
         excluded=collisions.excluded,
         gravity=gravity,
+        visuals=functools.partial(mjcf_visuals, Path(path).absolute()),
         keyframes=_keyframes(model, articulation, controls),
         not_modelled=warn_not_modelled(model.path, [*idle, *collisions.left_out, *left_out(model)]),
     )

@@ -23,6 +23,22 @@ def mjcf_collisions(model: CompiledModel) -> Collisions:
     return Collisions() if model.disabled("contact") else _Reader(model).collisions()
 
 
+def primitive(kind: str, a: float, b: float, c: float) -> Shape | None:
+    """A geom of MuJoCo's by its type and size; None for planes, height fields and meshes."""
+    match kind:
+        case "sphere":
+            return Sphere(a)
+        case "capsule":
+            return Capsule(a, b)
+        case "cylinder":
+            return Cylinder(a, b)
+        case "box":
+            return Box((a, b, c))
+        case "ellipsoid":
+            return Ellipsoid((a, b, c))
+    return None
+
+
 @dataclass(frozen=True, eq=False)
 class _Reader:
     model: CompiledModel
@@ -64,24 +80,12 @@ class _Reader:
 
     def _shape(self, g: int, losses: HullLosses) -> Shape | None:
         model, m = self.model, self.model.data
-        a, b, c = m.geom_size[g].tolist()
-        match model.geom_type(g):
-            case "sphere":
-                return Sphere(a)
-            case "capsule":
-                return Capsule(a, b)
-            case "cylinder":
-                return Cylinder(a, b)
-            case "box":
-                return Box((a, b, c))
-            case "ellipsoid":
-                return Ellipsoid((a, b, c))
-            case "mesh":
-                mesh = int(m.geom_dataid[g])
-                first, count = int(m.mesh_vertadr[mesh]), int(m.mesh_vertnum[mesh])
-                name = model.mesh(mesh)
-                return losses.keep(name, reduced_hull(m.mesh_vert[first : first + count].astype(float), name=name))
-        return None
+        if model.geom_type(g) != "mesh":
+            return primitive(model.geom_type(g), *m.geom_size[g].tolist())
+        mesh = int(m.geom_dataid[g])
+        first, count = int(m.mesh_vertadr[mesh]), int(m.mesh_vertnum[mesh])
+        name = model.mesh(mesh)
+        return losses.keep(name, reduced_hull(m.mesh_vert[first : first + count].astype(float), name=name))
 
     def _height_field(self, g: int) -> HeightField:
         """MuJoCo's rows run along y and its columns along x; heights are shares of the field's own."""

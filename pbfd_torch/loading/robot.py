@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from torch import Tensor
 
+from pbfd_torch.appearance import Visual
 from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
@@ -35,6 +37,7 @@ class Robot:
     excluded: pairs of names of links and obstacles that do not touch.
     gravity: [m/s²].
     keyframes: named states.
+    visuals: gives what links look like, where the file says so.
     not_modelled: what the file asks for and the simulation leaves out, one line each.
     """
 
@@ -47,4 +50,5 @@ class Robot:
     excluded: tuple[tuple[str, str], ...] = ()
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     keyframes: dict[str, Keyframe] = field(default_factory=dict)
+    visuals: Callable[[], Sequence[Visual]] = tuple
     not_modelled: tuple[str, ...] = ()

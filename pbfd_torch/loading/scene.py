@@ -33,7 +33,7 @@ def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace | Obstacle] | None =
     rules = ContactRules(NormalForce.for_weight(weight, penetration), excluded=excluded)
     terms += contact_terms(articulation, robot.colliders, obstacles, rules)
     gravity = torch.tensor(robot.gravity, dtype=articulation.dtype, device=articulation.device)
-    return Scene(articulation, tuple(terms), gravity, robot.colliders, obstacles, robot.name)
+    return Scene(articulation, tuple(terms), gravity, robot.colliders, obstacles, robot.name, robot.visuals)
 
 
 def ground_below(robot: Robot) -> HalfSpace:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,7 @@ from pbfd_torch.loading.robot import Robot
 from pbfd_torch.loading.urdf_colliders import urdf_collisions
 from pbfd_torch.loading.urdf_file import Parsed, UrdfFile, read_urdf
 from pbfd_torch.loading.urdf_placement import Placed, plane_axes, rotation_matrix
+from pbfd_torch.loading.urdf_visuals import urdf_visuals
 from pbfd_torch.terms.actuators import Actuator, Actuators
 
 _GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]; URDF has none
@@ -66,6 +68,7 @@ def load_urdf(
         obstacles=collisions.obstacles,
         excluded=collisions.excluded,
         gravity=_GRAVITY,
+        visuals=functools.partial(urdf_visuals, file.path.absolute(), articulation.link_names),
         not_modelled=warn_not_modelled(file.path, [*_ignored(joints), *file.left_out, *collisions.left_out]),
     )
 

@@ -62,6 +62,16 @@ def _colliders(file: UrdfFile, link: str, losses: HullLosses) -> list[Collider]:
 
 
 def _shape(geometry: Any, file: UrdfFile, losses: HullLosses) -> Shape:
+    shape = primitive(geometry)
+    if shape is not None:
+        return shape
+    x, y, z = geometry.scale or (1.0, 1.0, 1.0)
+    mesh = find_mesh(geometry.filename, file.path)
+    return losses.keep(mesh.name, load_hull(mesh, (x, y, z)))
+
+
+def primitive(geometry: Any) -> Shape | None:
+    """A parsed <geometry>; None for a mesh."""
     kind = type(geometry).__name__
     if kind == "Box":
         x, y, z = (0.5 * s for s in geometry.size)
@@ -72,9 +82,7 @@ def _shape(geometry: Any, file: UrdfFile, losses: HullLosses) -> Shape:
         return Cylinder(geometry.radius, 0.5 * geometry.length)
     if kind == "Capsule":
         return Capsule(geometry.radius, 0.5 * geometry.length)
-    x, y, z = geometry.scale or (1.0, 1.0, 1.0)
-    mesh = find_mesh(geometry.filename, file.path)
-    return losses.keep(mesh.name, load_hull(mesh, (x, y, z)))
+    return None
 
 
 def _flat(shape: Shape) -> bool:

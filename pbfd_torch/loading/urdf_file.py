@@ -41,10 +41,10 @@ def read_urdf(path: Path) -> UrdfFile:
     """Raises `ModelError` naming file, line and element for what is malformed, misses an attribute or has a name twice."""
     from pytorch_kinematics.urdf_parser_py import urdf
 
-    root = _root(existing_file(path))
+    root = root_of(existing_file(path))
     file = UrdfFile(path, root.get("name", path.stem))
     others: Counter[str] = Counter()
-    with _complaints() as complaints:
+    with complaints() as heard:
         for node in root:
             if node.tag in ("link", "joint"):
                 found, kind = (file.links, urdf.Link) if node.tag == "link" else (file.joints, urdf.Joint)
@@ -58,11 +58,12 @@ def read_urdf(path: Path) -> UrdfFile:
             elif node.tag != "material":
                 others[node.tag] += 1
     file.left_out += [f"<{tag}> ({count})" for tag, count in sorted(others.items())]
-    file.left_out += [f"{what} ({count})" for what, count in sorted(Counter(complaints).items())]
+    file.left_out += [f"{what} ({count})" for what, count in sorted(Counter(heard).items())]
     return file
 
 
-def _root(path: Path) -> Any:
+def root_of(path: Path) -> Any:
+    """The <robot> element; raises `ModelError` for what is none."""
     from lxml import etree
 
     try:
@@ -108,7 +109,7 @@ def _parse(node: Any, kind: Any, path: Path) -> Parsed:
 
 
 @contextmanager
-def _complaints() -> Iterator[list[str]]:
+def complaints() -> Iterator[list[str]]:
     """Collects what the parser would print on stderr about tags and attributes it does not know."""
     from pytorch_kinematics.urdf_parser_py.xml_reflection import core
 

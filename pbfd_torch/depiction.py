@@ -1,0 +1,125 @@
+"""From a scene to its appearance."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from pbfd_torch.appearance import Appearance, Color, JointMark, Plane, Visual
+from pbfd_torch.articulation import JointKind
+from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.shapes import Collider, Point
+from pbfd_torch.errors import PbfdError
+from pbfd_torch.kinematics import place
+from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.tessellation import tessellated
+
+if TYPE_CHECKING:
+    from pbfd_torch.scene import Scene
+
+_TONES: tuple[Color, ...] = ((0.16, 0.42, 0.66), (0.95, 0.61, 0.22))  # of links in turn, so that neighbours differ
+STONE: Color = (0.62, 0.62, 0.6)
+_THIN = 1e-3  # [m] half extents that a body without thickness is drawn with
+
+
+def depicted(scene: Scene) -> Appearance:
+    """A link looks like its visual shapes, else like its colliders, else like the box that has its inertia; numbers that differ
+    between worlds are those of the first."""
+    a = scene.articulation
+    links = range(a.nlink)
+    try:
+        visuals = list(scene.visuals())
+    except PbfdError as error:  # the robot's file may be gone by now; what was computed is not lost for that
+        warnings.warn(f"links look like their colliders: {error}", stacklevel=2)
+        visuals = []
+    seen = {x.body for x in visuals}
+    for k in (k for k in links if k not in seen):
+        mine = [x for x in scene.colliders if x.link == a.link_names[k]]
+        visuals += [*_worn(mine, k), *_skin([x for x in mine if isinstance(x.shape, Point)], k)] or _inertia_box(scene, k)
+    planes = []
+    for k, obstacle in enumerate(scene.obstacles, a.nlink):
+        if isinstance(obstacle, HalfSpace):
+            planes.append(Plane(obstacle.name, k, obstacle.normal, obstacle.offset))
+        else:
+            visuals.append(_visual(obstacle.name, k, tessellated(obstacle.shape), color=STONE))
+    gravity = scene.gravity.detach().reshape(-1, 3)[0].double()
+    strength = float(torch.linalg.vector_norm(gravity))
+    up = (0.0 - gravity / strength).tolist() if strength > 0 else (0.0, 0.0, 1.0)
+    return Appearance(tuple(visuals), tuple(planes), tuple(_joint_marks(scene)), tuple(up))
+
+
+def link_color(link: int) -> Color:
+    """The colour of a link that has none of its own."""
+    return _TONES[link % len(_TONES)]
+
+
+def visual_of(name: str, body: int, shape: Any, position: Sequence[float], quaternion: Sequence[float], color: Color) -> Visual:
+    """A shape of `contact.shapes` at a place in its body's frame."""
+    return _visual(name, body, tessellated(shape), position, quaternion, color)
+
+
+def _visual(
+    name: str,
+    body: int,
+    mesh: Any,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
+    color: Color = STONE,
+) -> Visual:
+    turn = quaternion_matrix(torch.nn.functional.normalize(torch.tensor(quaternion, dtype=torch.float64), dim=0)).numpy()
+    vertices = np.asarray(mesh.vertices, np.float64) @ turn.T + np.asarray(position, np.float64)
+    return Visual(name, body, vertices.astype(np.float32), np.asarray(mesh.faces, np.int32), color)
+
+
+def _worn(colliders: Iterable[Collider], link: int) -> list[Visual]:
+    solid = [x for x in colliders if not isinstance(x.shape, Point)]
+    return [visual_of(x.name, link, x.shape, x.position, x.quaternion, link_color(link)) for x in solid]
+
+
+def _skin(points: Sequence[Collider], link: int) -> list[Visual]:
+    """The hull of single points with their margins: they stand for a body between them."""
+    import trimesh
+
+    thick = [x for x in points if x.margin > 0]
+    if not thick:
+        return []
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=x.margin).vertices + np.array(x.position) for x in thick]
+    return [_visual("skin", link, trimesh.convex.convex_hull(np.concatenate(balls)), color=link_color(link))]
+
+
+def _inertia_box(scene: Scene, link: int) -> list[Visual]:
+    """The box of uniform density with the link's mass, centre of mass and inertia; nothing for a link without mass."""
+    import trimesh
+
+    a = scene.articulation
+    matrix = a.pseudo_inertia.detach().reshape(-1, a.nlink, 4, 4)[0, link].double()
+    mass = float(matrix[3, 3])
+    if mass <= 0:
+        return []
+    com = matrix[:3, 3] / mass
+    second, axes = torch.linalg.eigh(matrix[:3, :3] / mass - torch.outer(com, com))
+    half = (3 * second.clamp_min(0)).sqrt().clamp_min(_THIN).numpy()  # ∫x² over a box of half extent h is m h²/3
+    turn = (axes * torch.linalg.det(axes)).numpy()
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = turn, com.numpy()
+    return [_visual("inertia", link, trimesh.creation.box(2 * half, transform=place), color=link_color(link))]
+
+
+def _joint_marks(scene: Scene) -> Iterable[JointMark]:
+    """Every joint at the reference configuration, seen from the link that it carries."""
+    a, t = scene.articulation, scene.articulation.topology
+    with torch.no_grad():
+        placement = place(a, a.rest)
+        links = placement.poses.reshape(-1, a.nlink, 4, 4)[0].double()
+        nodes = placement.nodes.reshape(-1, t.nnode, 4, 4)[0].double()
+        axes = a.joint_axis.reshape(-1, t.njoint, 3)[0].double()
+        for j, name in enumerate(a.joint_names):
+            seen = torch.linalg.inv(links[t.joint_link[j]]) @ nodes[j + 1]
+            axis = (
+                tuple((seen[:3, :3] @ axes[j]).tolist()) if t.joint_sizes[j] == (JointKind.HINGE.nq, JointKind.HINGE.nv) else None
+            )
+            yield JointMark(name, t.joint_link[j], tuple(seen[:3, 3].tolist()), axis)
