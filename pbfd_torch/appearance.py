@@ -47,10 +47,13 @@ class Plane:
 
 @dataclass(frozen=True)
 class JointMark:
-    """A joint in the frame of the link that it carries; `axis`: unit vector, None for ball and free joints."""
+    """A joint in the frame of the link that it carries. `axis`: unit vector, None for ball and free joints. Its coordinates are the
+    `size` entries of q from `first` on."""
 
     name: str
     link: int
+    first: int
+    size: int
     anchor: tuple[float, float, float]
     axis: tuple[float, float, float] | None
 
@@ -106,6 +109,8 @@ def unpacked(words: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], links
         JointMark(
             str(x["name"]),
             _within(int(x["link"]), links),
+            int(x["first"]),
+            int(x["size"]),
             _three(x["anchor"]),
             None if x["axis"] is None else _three(x["axis"]),
         )

@@ -21,7 +21,7 @@ from pbfd_torch.tessellation import tessellated
 if TYPE_CHECKING:
     from pbfd_torch.scene import Scene
 
-_TONES: tuple[Color, ...] = ((0.16, 0.42, 0.66), (0.95, 0.61, 0.22))  # of links in turn, so that neighbours differ
+_TONES: tuple[Color, ...] = ((0.10, 0.33, 0.60), (0.93, 0.52, 0.12))  # of links in turn, so that neighbours differ
 STONE: Color = (0.62, 0.62, 0.6)
 _THIN = 1e-3  # [m] half extents that a body without thickness is drawn with
 
@@ -122,4 +122,4 @@ def _joint_marks(scene: Scene) -> Iterable[JointMark]:
             axis = (
                 tuple((seen[:3, :3] @ axes[j]).tolist()) if t.joint_sizes[j] == (JointKind.HINGE.nq, JointKind.HINGE.nv) else None
             )
-            yield JointMark(name, t.joint_link[j], tuple(seen[:3, 3].tolist()), axis)
+            yield JointMark(name, t.joint_link[j], t.q_start[j], t.joint_sizes[j][0], tuple(seen[:3, 3].tolist()), axis)
