@@ -30,6 +30,7 @@ from pbfd_torch.terms.load import LinkLoad, StepContext, Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.terms.static_friction import StaticFriction
 from tests.random_trees import generator, moved_q, random_q, random_tree
 from tests.states import state_of
@@ -149,6 +150,12 @@ def actuators(s: Situation) -> Actuators:
     )
 
 
+def pushes(s: Situation) -> Pushes:
+    """A random force of some newtons at a random point of every link."""
+    force, point = torch.randn((2, s.articulation.nlink, 3), generator=generator(71), dtype=torch.float64)
+    return Pushes(5 * force, 0.1 * point)
+
+
 def coefficients(s: Situation, size: float) -> Tensor:
     """Random `[nv]` > 0, equal about the three axes of a rotation and along those of a translation."""
     value = size * (0.5 + torch.rand(s.articulation.nv, dtype=torch.float64, generator=generator(11)))
@@ -222,5 +229,6 @@ TERMS = (
     TermCase("joint springs", lambda s: JointSprings(coefficients(s, 20.0), random_q(s.articulation, 17)), "potential"),
     TermCase("joint dry friction, sticking", lambda s: JointDryFriction(dry_torque(s), slip_speed=50.0)),
     TermCase("joint dry friction, sliding", lambda s: JointDryFriction(dry_torque(s), slip_speed=1e-4)),
+    TermCase("pushes", pushes, "energy"),
     TermCase("actuators", actuators),
 )

@@ -30,6 +30,7 @@ from pbfd_torch.terms.joint_springs import JointDamping, JointSprings, checked_c
 from pbfd_torch.terms.load import LinkLoad, Term
 from pbfd_torch.terms.normal_force import NormalForce, power
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.terms.pushes import Pushes
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS
 from tests.states import state_of
@@ -240,6 +241,8 @@ def test_physics_does_not_depend_on_the_frame(case: TermCase, axis: tuple[float,
         term_there = dataclasses.replace(term, surface=Plane(normal, term.surface.offset + normal @ shift))
     elif isinstance(term, JointSprings):
         term_there = dataclasses.replace(term, rest=in_frame(term.rest))
+    elif isinstance(term, Pushes):
+        term_there = dataclasses.replace(term, force=term.force @ quaternion_matrix(quaternion_exp(turn)).mT)
     here, moved = s.balance([term], s.q), there.balance([term_there], there.q)
     size = float(here.residual.abs().max())
     torch.testing.assert_close(moved.residual, here.residual @ change.mT, rtol=0, atol=1e-11 * size)

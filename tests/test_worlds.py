@@ -26,9 +26,10 @@ from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.load import JointLoad, LinkLoad, Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.worlds import Worlds, replaced
 from tests.random_trees import generator, random_q, random_tree
-from tests.term_cases import TERMS, Situation, TermCase, actuators, coefficients, contact, dry_torque, situation
+from tests.term_cases import TERMS, Situation, TermCase, actuators, coefficients, contact, dry_torque, pushes, situation
 
 TREE = random_tree(0)
 POINTS = len(contact(situation(0), None).link)
@@ -67,10 +68,10 @@ def taken(s: Situation, worlds: Worlds) -> Situation:
 
 
 def load_tensors(s: Situation, term: Term) -> list[tuple[Tensor, int]]:
-    """The tensors of the term's load, each with the number of its own dimensions."""
+    """The tensors of the term's load, each with the number of its own dimensions; forces held still have no stiffness."""
     load = term.load(term.prepare(s.context(s.q)), place(s.articulation, s.q))
     if isinstance(load, LinkLoad):
-        return [(load.moment, 3), (load.stiffness, 3)]
+        return [(load.moment, 3)] + [(load.stiffness, 3)] * (not isinstance(term, Pushes))
     assert isinstance(load, JointLoad)
     return [(load.residual, 1), (load.stiffness, 2)]
 
@@ -136,6 +137,11 @@ def actuators_per_world(s: Situation, lead: tuple[int, ...]) -> Actuators:
     return dataclasses.replace(bank, **changes)
 
 
+def pushes_per_world(s: Situation, lead: tuple[int, ...]) -> Pushes:
+    one = pushes(s)
+    return Pushes(spread(one.force, lead, one.force.shape), spread(one.point, lead, one.point.shape))
+
+
 def with_law(s: Situation, stiffness: Tensor) -> Contact:
     return dataclasses.replace(contact(s, CoulombFriction(0.7, 50.0)), normal_force=NormalForce(stiffness))
 
@@ -167,6 +173,7 @@ PARAMETERS = (
     ),
     ParameterCase("dry friction", lambda s, lead: JointDryFriction(spread(dry_torque(s), lead, (TREE.nv,)), 50.0)),
     ParameterCase("actuators", actuators_per_world),
+    ParameterCase("pushes", pushes_per_world),
 )
 all_parameters = pytest.mark.parametrize("case", PARAMETERS, ids=str)
 

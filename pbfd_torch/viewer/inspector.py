@@ -21,9 +21,7 @@ class Inspector:
     host, port: where; by default only this computer can see it, and the next free port is taken where the wanted one is not free.
     Raises `InputError` for a host or port that cannot be used, and for a ghost with other links."""
 
-    def __init__(
-        self, rollout: Rollout, ghost: Rollout | None = None, host: str = serving.HOST, port: int = serving.PORT
-    ) -> None:
+    def __init__(self, rollout: Rollout, ghost: Rollout | None = None, host: str = serving.HOST, port: int = serving.PORT) -> None:
         self.film, self._ghost = Film(rollout), None if ghost is None else Film(ghost)
         self.server = serving.start(host, port)
         self._closed = threading.Event()

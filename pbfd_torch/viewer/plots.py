@@ -63,7 +63,7 @@ class Plot:
         margin = 0.05 * (high - low) or max(0.05 * abs(high), 1e-12)
         self._low, self._high = low - margin, high + margin
         series = [uplot.Series(label="s")]
-        for k, label in enumerate(self._lines):
+        for label in self._lines:
             mine = list(self._curves.lines).index(label.removesuffix(", ghost"))
             dash = (4, 4) if label.endswith(", ghost") else ()
             series.append(uplot.Series(label=label, stroke=COLORS[mine % len(COLORS)], width=1.5, dash=dash, spanGaps=True))

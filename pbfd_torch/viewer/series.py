@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -39,9 +40,7 @@ def _numbers(value: torch.Tensor) -> Curve:
 
 def _of(film: Film, make: Callable[[Rollout], Mapping[str, torch.Tensor]]) -> Callable[[int], Curves]:
     def curves(world: int) -> Curves:
-        lines = {
-            name: _numbers(value.reshape(len(value), film.worlds)[:, world]) for name, value in make(film.rollout).items()
-        }
+        lines = {name: _numbers(value.reshape(len(value), film.worlds)[:, world]) for name, value in make(film.rollout).items()}
         time = _numbers(film.rollout.time)
         length = len(next(iter(lines.values())))
         return thinned(Curves(time[-length:], lines))  # what belongs to a step is drawn at its end
@@ -81,7 +80,7 @@ def thinned(curves: Curves) -> Curves:
     if n <= _POINTS:
         return curves
     edges = np.linspace(0, n, _POINTS // 2 + 1).astype(int)
-    stretches = list(zip(edges[:-1], edges[1:], strict=True))
+    stretches = list(itertools.pairwise(edges))
     time = np.ravel([(curves.time[a], curves.time[(a + b) // 2]) for a, b in stretches])
     lines = {name: np.ravel([(y[a:b].min(), y[a:b].max()) for a, b in stretches]) for name, y in curves.lines.items()}
     return Curves(time, lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import viser
@@ -29,7 +30,7 @@ class Timeline:
         self._clock: threading.Thread | None = None
         self.frame = 0
         self._words = gui.add_markdown(self._text())
-        self._slider = gui.add_slider("Step", 0, max(1, film.frames - 1), 1, 0, hint="Drag to scrub through the steps.")
+        self._slider: Any = gui.add_slider("Step", 0, max(1, film.frames - 1), 1, 0, hint="Drag to scrub through the steps.")
         self._strip = gui.add_html(strip(film))
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
         moves = gui.add_button_group("Go", ("first", "back", "next", "last"))
@@ -119,7 +120,7 @@ class Timeline:
 
 
 def strip(film: Film, world: int = 0) -> str:
-    """A bar over the steps as HTML: unsolved ones red, eased and halved ones and other detours in their colours; and what it says."""
+    """A bar over the steps as HTML: unsolved ones red, eased and halved ones and other detours in their colours; and a legend."""
     status: NDArray[np.int64] = film.rollout.status.reshape(film.rollout.steps, film.worlds)[:, world].cpu().numpy()
     ranks = np.zeros(len(status), int)
     for rank, kinds in enumerate(((Status.WARM_STARTED, Status.CONTINUED), (Status.EASED,), (Status.HALVED,)), 1):
@@ -131,7 +132,9 @@ def strip(film: Film, world: int = 0) -> str:
     width = 100 / columns
     wide = max(width, 0.6)
     bars = "".join(
-        f'<rect x="{k * width:.3f}%" width="{wide:.3f}%" height="10" fill="{colors[rank]}"/>' for k, rank in enumerate(worst) if rank
+        f'<rect x="{k * width:.3f}%" width="{wide:.3f}%" height="10" fill="{colors[rank]}"/>'
+        for k, rank in enumerate(worst)
+        if rank
     )
     names = ("", "other detours", "eased", "halved", "unsolved")
     counts = [(rank, int((ranks == rank).sum())) for rank in (4, 3, 2, 1)]
