@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -26,7 +27,17 @@ STONE: Color = (0.62, 0.62, 0.6)
 _THIN = 1e-3  # [m] half extents that a body without thickness is drawn with
 
 
+_KNOWN: WeakKeyDictionary[Scene, Appearance] = WeakKeyDictionary()
+
+
 def depicted(scene: Scene) -> Appearance:
+    """What a scene looks like; it is worked out once."""
+    if scene not in _KNOWN:
+        _KNOWN[scene] = _depicted(scene)
+    return _KNOWN[scene]
+
+
+def _depicted(scene: Scene) -> Appearance:
     """A link looks like its visual shapes, else like its colliders, else like the box that has its inertia; numbers that differ
     between worlds are those of the first."""
     a = scene.articulation

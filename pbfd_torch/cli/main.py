@@ -1,4 +1,4 @@
-"""The `pbfd` command: simulate, optimize, info, scenes, demo, bench."""
+"""The `pbfd` command: simulate, view, optimize, info, scenes, demo, bench."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pbfd_torch.cli.bench_slope import slope
 from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.optimize import optimize
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
+from pbfd_torch.cli.view import view
 from pbfd_torch.errors import NotModelledWarning, PbfdError
 
 app = typer.Typer(
@@ -33,6 +34,7 @@ bench.command()(hard_cases)
 bench.command()(slope)
 app.add_typer(bench, name="bench")
 app.command()(optimize)
+app.command()(view)
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)
 

@@ -34,11 +34,17 @@ class Touches:
     world: NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
 class Film:
     """A rollout with its batch as one axis. Nothing is copied: frames are cut out when they are asked for."""
 
-    rollout: Rollout
+    def __init__(self, rollout: Rollout) -> None:
+        self.rollout = rollout
+
+    def renew(self, rollout: Rollout) -> None:
+        """Goes on with another record of the same scene; what is known of sizes stays."""
+        self.rollout = rollout
+        for name in ("links", "center", "_obstacles"):
+            self.__dict__.pop(name, None)
 
     def _flat(self, value: Tensor, inner: int) -> Tensor:
         """`[time, *batch, …] → [time, worlds, …]` with `inner` dimensions after the batch."""

@@ -16,13 +16,13 @@ HOST, PORT = "127.0.0.1", 8080
 _TRIES = 100
 
 
-def start(host: str = HOST, port: int = PORT) -> viser.ViserServer:
-    """A server at a port, or at the next free one, which is then said on stderr. Raises `InputError` for a host or port that cannot
-    be used."""
+def start(host: str = HOST, port: int = PORT, quiet: bool = False) -> viser.ViserServer:
+    """A server at a port, or at the next free one, which is then said on stderr unless `quiet`. Raises `InputError` for a host or
+    port that cannot be used."""
     if not 1 <= port <= 65535:
         raise InputError(f"port is {port}: must be from 1 to 65535")
     free = _free_port(host, port)
-    if free != port:
+    if free != port and not quiet:
         print(f"pbfd: port {port} is taken: using {free}", file=sys.stderr)
     with _quiet():
         server = viser.ViserServer(host=host, port=free, label="pbfd_torch", verbose=False)

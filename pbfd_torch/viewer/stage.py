@@ -29,7 +29,7 @@ class Stage:
             raise InputError(f"the ghost has the links {names}: must be those of the other, {', '.join(film.rollout.link_names)}")
         self.film, self.ghost = film, ghost
         self.follows = film.travels
-        self._server, self._frame = server, 0
+        self.server, self._frame = server, 0
         scene = server.scene
         self._root = scene.add_frame(ROOT, show_axes=False)
         scene.set_up_direction(film.appearance.up)
@@ -45,7 +45,7 @@ class Stage:
 
     def place(self, worlds: list[int]) -> None:
         """Draws these worlds, side by side, from now on; at most `MOST`."""
-        with self._server.atomic():
+        with self.server.atomic():
             self.worlds = worlds[:MOST]
             self.places = offsets(self.film, len(self.worlds))
             self._ground.place(self.worlds, self.places)
@@ -62,7 +62,7 @@ class Stage:
         """Draws a frame of all worlds."""
         film = self.film
         self._frame = frame
-        with self._server.atomic():
+        with self.server.atomic():
             poses = film.poses(frame, self.worlds)
             self._bodies.show(poses)
             self._ground.show(frame)
@@ -88,11 +88,11 @@ class Stage:
 
     def look(self) -> None:
         """Gives every browser, those that come later too, that camera."""
-        view, initial = self.view, self._server.initial_camera
+        view, initial = self.view, self.server.initial_camera
         position, target = tuple(view.position.tolist()), tuple(view.target.tolist())
         initial.up = tuple(view.up.tolist())
         initial.position, initial.look_at, initial.fov = position, target, view.angle
-        for client in self._server.get_clients().values():
+        for client in self.server.get_clients().values():
             client.camera.up_direction = view.up
             client.camera.position, client.camera.look_at = view.position, view.target
             client.camera.fov = view.angle
