@@ -51,11 +51,12 @@ def _depicted(scene: Scene) -> Appearance:
     for k in (k for k in links if k not in seen):
         mine = [x for x in scene.colliders if x.link == a.link_names[k]]
         visuals += [*_worn(mine, k), *_skin([x for x in mine if isinstance(x.shape, Point)], k)] or _inertia_box(scene, k)
+    painted = {a.link_names[k] for k in seen if 0 <= k < a.nlink}
     planes = []
     for k, obstacle in enumerate(scene.obstacles, a.nlink):
         if isinstance(obstacle, HalfSpace):
             planes.append(Plane(obstacle.name, k, obstacle.normal, obstacle.offset))
-        else:
+        elif obstacle.name not in painted:  # a link fixed to the world, which has visuals
             visuals.append(_visual(obstacle.name, k, tessellated(obstacle.shape), color=STONE))
     gravity = scene.gravity.detach().reshape(-1, 3)[0].double()
     strength = float(torch.linalg.vector_norm(gravity))

@@ -131,11 +131,11 @@ class Rollout:
         """Reads what `save` wrote; never unpickles. Raises `InputError` for a file that is missing, damaged, foreign or of another
         version, that claims more than 32 GiB, or whose arrays do not fit each other."""
         try:
-            with np.load(path, allow_pickle=False) as file:
-                if not isinstance(file, np.lib.npyio.NpzFile):
-                    raise InputError(f"'{path}' is not a readable rollout: it is a single array")
-                packed_file: Any = file.zip
-                size = sum(entry.file_size for entry in packed_file.infolist())
+            found: Any = np.load(path, allow_pickle=False)
+            if isinstance(found, np.ndarray):
+                raise InputError(f"'{path}' is not a readable rollout: it is a single array")
+            with found as file:
+                size = sum(entry.file_size for entry in file.zip.infolist())
                 if size > LARGEST:
                     raise InputError(f"'{path}' claims {size / 2**30:.3g} GiB: must be at most {LARGEST / 2**30:.0f}")
                 meta = json.loads(str(file["meta"]))

@@ -10,7 +10,7 @@ from typing import Any
 
 from pbfd_torch.errors import InputError
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 _FLAGS = (
     "--no-sandbox",
     "--disable-gpu",
@@ -35,7 +35,7 @@ def page(width: int, height: int, offline: bool = False) -> Iterator[Any]:
         from playwright.sync_api import sync_playwright
     except ImportError:
         raise InputError("pictures need the package playwright: pip install 'pbfd_torch[film]'") from None
-    executable = next((path for name in _NAMES if (path := shutil.which(name))), None)
+    executable = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     with sync_playwright() as driver, tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         try:
             context = driver.chromium.launch_persistent_context(
@@ -47,7 +47,7 @@ def page(width: int, height: int, offline: bool = False) -> Iterator[Any]:
                 offline=offline,
             )
         except Exception as error:  # playwright's own, of many kinds
-            names = ", ".join(_NAMES)
+            names = ", ".join(BROWSERS)
             raise InputError(
                 f"no browser could be started ({str(error).splitlines()[0]}): install one of {names}, for example with "
                 "'apt install chromium', or run 'playwright install chromium'"

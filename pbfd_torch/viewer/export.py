@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import ParamSpec
 
 import numpy as np
 import viser
@@ -24,8 +27,23 @@ from pbfd_torch.viewer.stage import Stage
 RATE = 30.0  # [frames/s] of films and pages at most
 MOST_FRAMES = 3000  # of a page: it holds them all
 FILMS = (".mp4", ".gif")
+_WINDOW = (320, 240)  # of the browser, which draws that all the time besides the pictures
 _LOADING = 30.0  # [s] that a browser may take to show up
 _SETTLING = 1.5  # [s] after which shadows and meshes are there
+
+
+P = ParamSpec("P")
+
+
+def _apart(function: Callable[P, None]) -> Callable[P, None]:
+    """The function in a thread of its own: a browser cannot be driven beside the event loop of a notebook."""
+
+    @functools.wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> None:
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(function, *args, **kwargs).result()
+
+    return alone
 
 
 def frames_shown(film: Film, rate: float = RATE, most: int | None = None) -> tuple[NDArray[np.int64], float]:
@@ -52,6 +70,7 @@ def save_html(
     _write(target, text.encode())
 
 
+@_apart
 def save_png(
     rollout: Rollout,
     path: str | os.PathLike[str],
@@ -73,16 +92,18 @@ def save_png(
     with _stage(rollout, ghost, worlds, contacts) as stage, _camera(stage, size) as picture:
         stage.show(frame)
         time.sleep(_SETTLING)
-        _write(target, iio.imwrite("<bytes>", picture(), extension=".png"))
+        still: bytes = iio.imwrite("<bytes>", picture(), extension=".png")
+        _write(target, still)
 
 
+@_apart
 def save_film(
     rollout: Rollout,
     path: str | os.PathLike[str],
     ghost: Rollout | None = None,
     worlds: int = 1,
     contacts: bool = False,
-    size: tuple[int, int] = (1280, 720),
+    size: tuple[int, int] = (960, 540),
     progress: Callable[[int, int], object] | None = None,
 ) -> None:
     """An .mp4 (H.264) or .gif in real time. progress: called with the number of frames done and their number. Raises `InputError`
@@ -127,7 +148,7 @@ def _stage(rollout: Rollout, ghost: Rollout | None, worlds: int, contacts: bool)
 @contextlib.contextmanager
 def _camera(stage: Stage, size: tuple[int, int]) -> Iterator[Callable[[], NDArray[np.uint8]]]:
     """Takes pictures of the stage through a browser without a window."""
-    with page(*size) as tab:
+    with page(*_WINDOW) as tab:
         tab.goto(serving.address(stage.server))
         client = _client(stage.server)
         view = stage.view

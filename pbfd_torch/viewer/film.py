@@ -157,10 +157,27 @@ class Film:
     @cached_property
     def path_bounds(self) -> tuple[Array, Array]:
         """`bounds` over the whole motion of all worlds, from some of its frames and worlds."""
+        return self._over_time(np.zeros(3))
+
+    @cached_property
+    def reach(self) -> Array:
+        """How much room a world takes along each axis `[3]` [m]: where it travels, what its bodies take around their centre."""
+        low, high = self._over_time(np.ones(3)) if self.travels else self.path_bounds
+        return high - low
+
+    def _over_time(self, held: NDArray[np.float64]) -> tuple[Array, Array]:
+        """Lowest and highest coordinates over time; `held`: 1 where the centre of mass is held in its place."""
+        center = np.nan_to_num(self.center.cpu().numpy())
         frames = np.unique(np.linspace(0, self.frames - 1, min(self.frames, _SAMPLES)).astype(int))
         worlds = np.unique(np.linspace(0, self.worlds - 1, min(self.worlds, 4)).astype(int))
-        all_bounds = [self.bounds(int(f), int(w)) for w in worlds for f in frames[:: max(1, len(worlds))]]
-        return np.min([x for x, _ in all_bounds], 0), np.max([x for _, x in all_bounds], 0)
+        lows, highs = [], []
+        for w in worlds:
+            for f in frames[:: len(worlds)]:
+                low, high = self.bounds(int(f), int(w))
+                shift = held * (center[f, w] - center[0, w])
+                lows.append(low - shift)
+                highs.append(high - shift)
+        return np.min(lows, 0).astype(np.float32), np.max(highs, 0).astype(np.float32)
 
     @cached_property
     def travels(self) -> bool:

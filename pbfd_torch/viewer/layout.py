@@ -19,8 +19,7 @@ _FILL = 1.0  # of the distance at which a ball around everything just fits
 
 def offsets(film: Film, count: int) -> Array:
     """Places of `count` worlds `[count, 3]` on a grid in the x–y plane, about as long as wide, the first at the origin."""
-    low, high = film.path_bounds
-    pitch = [float(high[k] - low[k]) + _GAP * film.size for k in (0, 1)]
+    pitch = [float(film.reach[k]) + _GAP * film.size for k in (0, 1)]
     columns = min(count, max(1, math.ceil(math.sqrt(count * pitch[1] / pitch[0]))))  # along x
     index = np.arange(count)
     places: Array = np.stack((pitch[0] * (index % columns), -pitch[1] * (index // columns), 0 * index), -1).astype(np.float32)

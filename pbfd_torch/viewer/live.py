@@ -157,6 +157,15 @@ class Live:
                 f"{self._dt / max(spent, 1e-9):.1f} × real time at most"
             )
 
+    def reset(self) -> None:
+        """Back to the start, drawn."""
+        with self._lock:
+            self._rebuild(*self._start)
+            self.step()
+            self.stage.show(0)  # where that step began
+            self._rebuild(*self._start)
+            self.steps = 0
+
     # controls -------------------------------------------------------------------------------------------------------------
 
     def _change(self, **changes: Any) -> None:
@@ -186,11 +195,7 @@ class Live:
             self._paused = not self._paused
             pause.label = "Go on" if self._paused else "Pause"
 
-        @reset.on_click
-        def _(_: object) -> None:
-            with self._lock:
-                self.steps = 0
-                self._rebuild(*self._start)
+        reset.on_click(lambda _: self.reset())
 
         dt.on_update(lambda _: self._change(dt=float(dt.value)))
         scheme.on_update(lambda _: self._change(integrator=scheme.value))

@@ -65,13 +65,14 @@ class Stage:
         with self.server.atomic():
             poses = film.poses(frame, self.worlds)
             self._bodies.show(poses)
-            self._ground.show(frame)
+            shift = self._shift(frame)
+            self._ground.show(frame, -np.array(shift, np.float32))
             self.marks.show(frame, poses)
             self.contacts.show(frame, self.worlds, self.places)
             if self._shadow is not None and self.ghost is not None and self._shadow_worlds:
                 same = min(round(frame * film.dt / self.ghost.dt), self.ghost.frames - 1)
                 self._shadow.show(self.ghost.poses(same, self._shadow_worlds))
-            self._root.position = self._shift(frame)
+            self._root.position = shift
 
     def _shift(self, frame: int) -> tuple[float, float, float]:
         """Where the root is so that the first world's centre of mass stays in its place."""
