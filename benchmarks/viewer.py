@@ -59,7 +59,6 @@ def frame_cost() -> None:
 
 
 def open_long(path: Path) -> None:
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     started = time.perf_counter()
     rollout = Rollout.load(path)
     loaded = time.perf_counter() - started
@@ -71,7 +70,7 @@ def open_long(path: Path) -> None:
     size = path.stat().st_size / 2**20
     print(
         f"{LONG} frames of 10 links, {size:.0f} MiB file: loaded in {loaded:.2f} s, shown after {shown:.2f} s; "
-        f"peak memory {peak / 2**20:.2f} GiB, {before / 2**20:.2f} of them before"
+        f"peak memory {peak / 2**20:.2f} GiB"
     )
 
 

@@ -48,7 +48,8 @@ def _depicted(scene: Scene) -> Appearance:
         warnings.warn(f"links look like their colliders: {error}", stacklevel=2)
         visuals = []
     seen = {x.body for x in visuals}
-    for k in (k for k in links if k not in seen):
+    standing = {x.name for x in scene.obstacles}  # links fixed to the world are obstacles of their name
+    for k in (k for k in links if k not in seen and a.link_names[k] not in standing):
         mine = [x for x in scene.colliders if x.link == a.link_names[k]]
         visuals += [*_worn(mine, k), *_skin([x for x in mine if isinstance(x.shape, Point)], k)] or _inertia_box(scene, k)
     painted = {a.link_names[k] for k in seen if 0 <= k < a.nlink}

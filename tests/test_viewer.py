@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from pbfd_torch import InputError, Rollout, Simulator, Status
+from pbfd_torch.contact.motion import Turntable
 from pbfd_torch.depiction import depicted
 from pbfd_torch.loading import load_robot
 from pbfd_torch.loading.scene import robot_scene
@@ -77,10 +78,9 @@ def test_moving_obstacles_are_where_they_are() -> None:
     disc = film.appearance.visuals[-1]
     assert disc.body == 2
     turned = film.poses(10, [0])[0, 2, :, :3] @ film.poses(0, [0])[0, 2, :, :3].T
-    assert math.atan2(turned[1, 0], turned[0, 0]) == pytest.approx(
-        float(SCENES["turntable"]().scene.obstacles[0].motion.rate) * 0.2,
-        abs=1e-5,  # type: ignore[union-attr]
-    )
+    (motion,) = (x.motion for x in SCENES["turntable"]().scene.obstacles)
+    assert isinstance(motion, Turntable)
+    assert math.atan2(turned[1, 0], turned[0, 0]) == pytest.approx(motion.rate * 0.2, abs=1e-5)
 
 
 def test_contact_forces_fall_into_push_and_grip(rollout: Rollout) -> None:
@@ -167,7 +167,7 @@ def test_urdf_visuals(tmp_path: Path) -> None:
     gone = robot_scene(load_robot(other, free_base=False))
     other.unlink()
     with pytest.warns(UserWarning, match="colliders"):
-        assert {x.name for x in depicted(gone).visuals} == {"base_0", "rod_0"}
+        assert {x.name for x in depicted(gone).visuals} == {"base", "rod_0"}
 
 
 def test_mjcf_visuals(tmp_path: Path) -> None:
