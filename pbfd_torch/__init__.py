@@ -13,6 +13,7 @@ from pbfd_torch.linearization import Chart, Linearization
 from pbfd_torch.parameters import parameters, with_parameters
 from pbfd_torch.rollout import Rollout
 from pbfd_torch.scene import Scene
+from pbfd_torch.show import view
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -52,5 +53,6 @@ __all__ = [
     "Variational",
     "contact_jacobians",
     "parameters",
+    "view",
     "with_parameters",
 ]

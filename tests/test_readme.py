@@ -12,8 +12,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The Python blocks print solved steps, write the rollout that they name, and print the derivative that they say."""
-    example, derivative = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    """The Python blocks print solved steps, write the rollout that they name, print the derivative that they say, and show the rollout."""
+    example, derivative, shown = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.strip().splitlines()) <= 16
     monkeypatch.chdir(tmp_path)
     exec(compile(example, "README.md", "exec"), {})
@@ -21,6 +21,7 @@ def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert (tmp_path / "hopper.npz").stat().st_size > 10_000
     exec(compile(derivative, "README.md", "exec"), {})
     assert "slides 0.1699 m, by μ -0.5678 m" in capsys.readouterr().out
+    exec(compile(shown, "README.md", "exec"), {})
 
 
 def test_the_two_commands_are_in_the_makefile() -> None:

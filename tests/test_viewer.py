@@ -6,6 +6,8 @@ import dataclasses
 import json
 import math
 import socket
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,12 @@ def rolled(name: str = "chain-slope-drop", steps: int = 12, worlds: int = 2, dt:
 @pytest.fixture(scope="module")
 def rollout() -> Rollout:
     return rolled()
+
+
+def test_the_viewer_is_loaded_only_when_it_is_used() -> None:
+    """`import pbfd_torch` and the command's help load neither viser nor trimesh."""
+    code = "import sys, pbfd_torch, pbfd_torch.cli.main; assert not {'viser', 'trimesh', 'playwright'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 # Frames ---------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from pbfd_torch.viewer.film import Array, Film, Touches
 STICKS, SLIDES = (35, 160, 75), (235, 105, 20)
 NORMAL, DEPTH = (40, 70, 160), (205, 25, 40)
 _LENGTH = 0.5  # of the film's scale: an arrow of a strong but usual force, at scale 1
+_LONGEST = 1.0  # of the film's scale, at scale 1: arrows of impacts are cut off there
 
 
 class Contacts:
@@ -50,14 +51,22 @@ class Contacts:
             return
         at = self._film.touches(frame, worlds)
         start = at.point + places[at.world]
-        length = self.scale * _LENGTH * self._film.scale / self._film.strongest
-        _arrows(self._normal, self.forces, start, length * at.push)
+        push, grip = self._stretched(at.push), self._stretched(at.grip)
+        _arrows(self._normal, self.forces, start, push)
         for slides, handle in self._grips.items():
             mine = at.slides == slides
-            _arrows(handle, self.forces, start[mine], length * at.grip[mine])
+            _arrows(handle, self.forces, start[mine], grip[mine])
         inside = at.depth > 0
         _arrows(self._depth, self.depths, start[inside], self.depth_scale * (at.depth[:, None] * at.normal)[inside])
         self._show_points(at, start)
+
+    def _stretched(self, force: Array) -> Array:
+        """Forces as arrows [m]."""
+        arrows = self.scale * _LENGTH * self._film.scale / self._film.strongest * force
+        longest = self.scale * _LONGEST * self._film.scale
+        size = np.linalg.norm(arrows, axis=-1, keepdims=True)
+        cut: Array = arrows * np.minimum(1, longest / np.maximum(size, 1e-12)).astype(np.float32)
+        return cut
 
     def _show_points(self, at: Touches, start: Array) -> None:
         self._points.visible = self.points and len(start) > 0

@@ -123,7 +123,7 @@ class Inspector:
         toggle("Follow", stage, "follows", "Keep the centre of mass of the first world in its place.")
         with gui.add_folder("Contacts"):
             toggle("Contact points", contacts, "points", "Green: sticks. Orange: slides, on the friction cone.")
-            toggle("Contact forces", contacts, "forces", "Blue: normal force. Green or orange: friction.")
+            toggle("Contact forces", contacts, "forces", "Blue: normal force. Green or orange: friction. Impacts are cut off.")
             stretch("Force scale", "scale", 5.0, 0.1, "Length of the arrows.")
             toggle("Penetration", contacts, "depths", "Red: how deep, stretched.")
             stretch("Depth scale", "depth_scale", 200.0, 5.0, "How many times deeper the arrows are than the contacts.")

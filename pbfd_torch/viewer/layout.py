@@ -14,7 +14,7 @@ MOST = 64  # worlds beside each other
 _GAP = 0.25  # of a world's size, between neighbours
 _SIDE = np.array((0.45, -1.0, 0.0))  # planar robots move in x and z
 _RISE = 0.34  # of the camera per metre of distance
-_FILL = 1.0  # of the distance at which a ball around everything just fits
+_FILL = 0.85  # of the distance at which a ball around everything just fits
 
 
 def offsets(film: Film, count: int) -> Array:

@@ -62,7 +62,7 @@ class Live:
         self._control = _first_control(setup, self._scene)
         self._lock = threading.RLock()
         self._closed, self._paused = threading.Event(), False
-        self.steps = 0
+        self.steps, self.time = 0, 0.0
         self._rebuild(*self._start)
         self.film = Film(self._record(*self._advanced()))
         self._rebuild(*self._start)
@@ -98,6 +98,8 @@ class Live:
         """Stops stepping and serving."""
         if not self._closed.is_set():
             self._closed.set()
+            if hasattr(self, "_clock"):
+                self._clock.join(60.0)  # a step that is being solved must not outlive the interpreter
             serving.stop(self.server)
 
     # stepping -------------------------------------------------------------------------------------------------------------
@@ -146,6 +148,7 @@ class Live:
             before, solution, objective = self._advanced()
             self.film.renew(self._record(before, solution, objective))
             self.steps += 1
+            self.time += self._dt
             spent = time.perf_counter() - started
             if self._closed.is_set():
                 return
@@ -153,7 +156,7 @@ class Live:
             status = Status(int(solution.status[0])).name.lower().replace("_", " ")
             red = "" if bool(solution.solved[0]) else "**"
             self._words.content = (
-                f"{self.steps * self._dt:.2f} s · {red}{status}{red}, {int(solution.evaluations[0])} evaluations · "
+                f"{self.time:.2f} s · {red}{status}{red}, {int(solution.evaluations[0])} evaluations · "
                 f"{self._dt / max(spent, 1e-9):.1f} × real time at most"
             )
 
@@ -164,7 +167,7 @@ class Live:
             self.step()
             self.stage.show(0)  # where that step began
             self._rebuild(*self._start)
-            self.steps = 0
+            self.steps, self.time = 0, 0.0
 
     # controls -------------------------------------------------------------------------------------------------------------
 

@@ -35,7 +35,7 @@ class Marks:
             self._handles.append(self._frames)
         if self.axes and film.appearance.joints:
             still = np.zeros((count * len(film.appearance.joints), 2, 3), np.float32)
-            self._axes = self._scene.add_line_segments(f"{self._root}/axes", still, _AXIS, thickness=3.0)
+            self._axes = self._scene.add_line_segments(f"{self._root}/axes", still, _AXIS, thickness=3.0, thickness_units="screen")
             self._handles.append(self._axes)
         if self.centers:
             ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03 * size)
@@ -54,7 +54,9 @@ class Marks:
         path = np.nan_to_num(film.center[frames][:, self._worlds].cpu().numpy().astype(np.float32)) + self._places
         pieces = np.stack((path[:-1], path[1:]), -2).reshape(-1, 2, 3)
         if len(pieces):
-            self._handles.append(self._scene.add_line_segments(f"{self._root}/trails", pieces, _CENTER, thickness=2.0))
+            self._handles.append(
+                self._scene.add_line_segments(f"{self._root}/trails", pieces, _CENTER, thickness=2.0, thickness_units="screen")
+            )
 
     def show(self, frame: int, poses: Array) -> None:
         """Moves the marks to the poses `[worlds, nbody + 1, 3, 4]` of a frame."""

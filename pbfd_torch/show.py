@@ -1,0 +1,18 @@
+"""The viewer's door, which loads it only when it is used."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pbfd_torch.rollout import Rollout
+
+if TYPE_CHECKING:
+    from pbfd_torch.viewer import Inspector
+
+
+def view(rollout: Rollout, ghost: Rollout | None = None, host: str = "127.0.0.1", port: int = 8080) -> Inspector:
+    """Shows a rollout in the browser, and another one of the same robot as a ghost over it. Returns at once: the result says its
+    `address`, is shown in place by notebooks, waits with `wait()` and ends with `close()`: see `pbfd_torch.viewer.Inspector`."""
+    from pbfd_torch.viewer import Inspector
+
+    return Inspector(rollout, ghost, host, port)
