@@ -2,7 +2,6 @@
 
     python benchmarks/screenshots.py docs
 
-Needs Chromium or Chrome. Writes viewer-contacts.png, viewer-plots.png, viewer-ghost.png, viewer-worlds.png and
 viewer-live.png.
 """
 
@@ -71,7 +70,6 @@ def main(folder: Path) -> None:
         inspector = Inspector(rolled(setup, 0.008, 1.2, v), port=8951)
         inspector.stage.contacts.points = inspector.stage.contacts.forces = True
         inspector.timeline.go(85)
-        taken(tab, inspector, folder / "viewer-plots.png", lambda: tab.get_by_role("tab", name="Plots").click())
 
         setup = SCENES["chain-fixed"]()
         inspector = Inspector(rolled(setup, 0.002, 1.0), rolled(setup, 0.1, 1.0), port=8952)

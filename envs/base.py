@@ -1,0 +1,304 @@
+"""What all environments share: a batch of worlds that torchrl steps and resets, without state of its own."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from pbfd_torch.envs.packing import packed, unpacked
+from pbfd_torch.envs.randomization import Randomization
+from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import Integrator, State
+from pbfd_torch.models.setup import Setup
+from pbfd_torch.simulator import Simulator
+from pbfd_torch.solvers.per_world import chosen
+from pbfd_torch.terms.actuators import Actuators
+
+POOL = 256  # starts that are made at once, at least: each costs a solve
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What happened in a control step of all worlds.
+
+    Attributes:
+        before, q, v: configuration before and after `[worlds, nq]`, and velocity after `[worlds, nv]`.
+        action: `[worlds, nu]`, within its range.
+        time: [s] that passed.
+    """
+
+    before: Tensor
+    q: Tensor
+    v: Tensor
+    action: Tensor
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A control step's end, with derivatives where the state or the action carry them.
+
+    Attributes:
+        state: of the integrator.
+        observation: `[worlds, nobs]` in the simulation's dtype.
+        reward: `[worlds]`.
+        terminated: `[worlds]` bool, by the task or because a step is unsolved.
+        unsolved: `[worlds]` bool.
+    """
+
+    state: State
+    observation: Tensor
+    reward: Tensor
+    terminated: Tensor
+    unsolved: Tensor
+
+
+class PbfdEnv(EnvBase):
+    """A batch `[num_envs]` of worlds. Subclasses say what the scene is, what is seen, and what is good.
+
+    The tensordict holds "observation" (float32), "action" (float32, from −1 to 1 or the actuators' range), "reward", "done",
+    "terminated", "truncated", "unsolved", and "state": the integrator's state, the step count and, with a `randomization`, what each
+    world has drawn. Nothing else is remembered, so any tensordict of an earlier step can be gone on from.
+
+    Arguments:
+        num_envs: worlds ≥ 1. device, dtype (float64 or float32): of the simulation.
+        seed: of resets and randomisation; None: 0.
+        control_dt: [s] between actions; None: the task's. dt: [s] step of the simulation, a whole fraction of it; None: the same.
+        integrator: None: implicit Euler, the paper's: at control steps of 8 ms of robots that stand on the ground it is about as
+            accurate as the others and cheaper.
+        max_episode_steps: after which an episode is truncated; None: the task's.
+        randomization: see `Randomization`.
+
+    Actions out of range are clipped, and costs are those of the clipped action. An action with NaN counts as zero, and its world is
+    terminated and marked "unsolved", as is one whose step has no solution; its last observation is the one before. Raises
+    `InputError` for arguments out of range, and for actions of another shape."""
+
+    batch_locked = True
+    task_dt = 0.008
+    task_steps = 1000
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float64,
+        seed: int | None = None,
+        control_dt: float | None = None,
+        dt: float | None = None,
+        integrator: Integrator[Any] | None = None,
+        max_episode_steps: int | None = None,
+        randomization: Randomization | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise InputError(f"num_envs is {num_envs}: must be ≥ 1")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.control_dt = self.task_dt if control_dt is None else control_dt
+        self.dt = self.control_dt if dt is None else dt
+        self.substeps = round(self.control_dt / self.dt)
+        if self.substeps < 1 or abs(self.substeps * self.dt - self.control_dt) > 1e-9 * self.control_dt:
+            raise InputError(f"dt is {self.dt} s: must divide the control step, {self.control_dt} s")
+        self.max_episode_steps = self.task_steps if max_episode_steps is None else max_episode_steps
+        if self.max_episode_steps < 1:
+            raise InputError(f"max_episode_steps is {self.max_episode_steps}: must be ≥ 1")
+        self.randomization = randomization
+        self.setup = self.make_setup(dtype, torch.device(device))
+        self.scene = self.setup.scene
+        self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler())
+        (bank,) = (term for term in self.scene.terms if isinstance(term, Actuators))
+        self._low, self._high = bank.control_range.unbind(-1)
+        if not bool(torch.isfinite(bank.control_range).all()):
+            raise InputError("actuators of an environment need control ranges")
+        self._seed = 0 if seed is None else seed
+        self._set_seed(self._seed)
+        start = self._fresh(1)
+        self._like: State = self._state_like
+        self._make_specs(start)
+
+    # what a task says ------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def make_setup(self, dtype: torch.dtype, device: torch.device) -> Setup:
+        """The scene, for one world, with one bank of actuators that have ranges."""
+
+    @abstractmethod
+    def observe(self, q: Tensor, v: Tensor) -> Tensor:
+        """`[worlds, nobs]`."""
+
+    @abstractmethod
+    def reward(self, step: Step) -> Tensor:
+        """`[worlds]`."""
+
+    def healthy(self, q: Tensor, v: Tensor) -> Tensor:
+        """`[worlds]` bool: whether the episode goes on."""
+        return torch.ones_like(q[:, 0], dtype=torch.bool)
+
+    def start(self, worlds: int, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Where episodes start, `[worlds, nq]` and `[worlds, nv]`: the setup's start with noise of `noise` on every entry."""
+        q, v = (x.expand(worlds, -1) for x in (self.setup.q, self.setup.v))
+        return self._noisy(q, random), self._noisy(v, random)
+
+    noise = 5e-3
+
+    def _noisy(self, value: Tensor, random: torch.Generator) -> Tensor:
+        share = torch.rand(value.shape, generator=random, dtype=torch.float64, device=value.device).to(value.dtype)
+        return value + self.noise * (2 * share - 1)
+
+    # torchrl's side --------------------------------------------------------------------------------------------------
+
+    def _make_specs(self, start: Mapping[str, Tensor]) -> None:
+        shape, device = self.batch_size, self.device
+        width = self.observe(self.setup.q[:1], self.setup.v[:1]).shape[-1]
+        state = Composite(
+            {
+                name: Unbounded((*shape, *value.shape[1:]), dtype=value.dtype, device=device)
+                for name, value in start.items()
+            },
+            shape=shape,
+        )
+        self.observation_spec = Composite(
+            observation=Unbounded((*shape, width), dtype=torch.float32, device=device),
+            unsolved=Binary(1, (*shape, 1), dtype=torch.bool, device=device),
+            state=state,
+            shape=shape,
+        )
+        self.state_spec = Composite(state=state.clone(), shape=shape)
+        low, high = (x.float().expand(*shape, -1).clone() for x in (self._low, self._high))
+        self.action_spec = Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device)
+        flags = {name: Binary(1, (*shape, 1), dtype=torch.bool, device=device) for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(flags, shape=shape)
+        self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32, device=device)
+
+    @property
+    def _supports_set_state(self) -> bool:
+        return True
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._random = torch.Generator(self.device).manual_seed(0 if seed is None else seed)
+        self._pool: dict[str, Tensor] = {}
+
+    def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any) -> TensorDictBase:
+        if set_state and tensordict is not None and "state" in tensordict.keys():
+            state = {name: value for name, value in tensordict["state"].items()}
+            return self._seen(unpacked(state, self._like), state)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        where = torch.ones(self.batch_size, dtype=torch.bool, device=self.device) if mask is None else mask.reshape(self.batch_size)
+        index = where.nonzero().squeeze(-1)
+        fresh = self._taken(len(index))
+        # rows that are not reset are not read: torchrl keeps those of the step
+        whole = {name: value.new_zeros((*self.batch_size, *value.shape[1:])) for name, value in fresh.items()}
+        state = {name: value.index_copy(0, index, fresh[name]) for name, value in whole.items()}
+        return self._seen(unpacked(state, self._like), state)
+
+    def _seen(self, state: State, flat: Mapping[str, Tensor]) -> TensorDictBase:
+        none = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        return TensorDict(
+            {
+                "observation": self.observe(state.q, self._velocity(self.simulator, state)).float(),
+                "unsolved": none,
+                "done": none.clone(),
+                "terminated": none.clone(),
+                "truncated": none.clone(),
+                "state": TensorDict(dict(flat), self.batch_size),
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        flat = dict(tensordict["state"].items())
+        action = tensordict["action"]
+        if action.shape != self.action_spec.shape:
+            raise InputError(f"action has shape {tuple(action.shape)}: must be {tuple(self.action_spec.shape)}")
+        with torch.no_grad():
+            outcome = self.advanced(unpacked(flat, self._like), action, flat)
+        steps = flat["steps"] + 1
+        truncated = (steps >= self.max_episode_steps) & ~outcome.terminated[:, None]
+        state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in ("factors", "push") if name in flat}
+        if self.randomization is not None:
+            state["push"] = self.randomization.pushed(flat["push"], self._random)
+        return TensorDict(
+            {
+                "observation": outcome.observation.float(),
+                "reward": outcome.reward.float()[:, None],
+                "unsolved": outcome.unsolved[:, None],
+                "terminated": outcome.terminated[:, None],
+                "truncated": truncated,
+                "done": outcome.terminated[:, None] | truncated,
+                "state": TensorDict(state, self.batch_size),
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+    # the simulation's side -------------------------------------------------------------------------------------------
+
+    def advanced(self, state: State, action: Tensor, drawn: Mapping[str, Tensor] | None = None) -> Outcome:
+        """A control step from a state under an action `[worlds, nu]`, with derivatives where these carry any. drawn: what the worlds
+        of a `randomization` have drawn, as in the tensordict's "state"."""
+        simulator = self._of(drawn)
+        bad = torch.isnan(action).any(-1)
+        control = torch.where(bad[:, None], 0.0, action).to(self.scene.articulation.dtype).clamp(self._low, self._high)
+        now, solved = state, ~bad
+        for _ in range(self.substeps):
+            now, solution = simulator.step(now, control)
+            solved = solved & solution.solved
+        v = self._velocity(simulator, now)
+        finite = torch.isfinite(now.q).all(-1) & torch.isfinite(v).all(-1)
+        unsolved = ~(solved & finite)
+        now = chosen(unsolved, state, now)
+        v = torch.where(unsolved[:, None], self._velocity(simulator, state), v)
+        terminated = unsolved | ~self.healthy(now.q, v)
+        reward = self.reward(Step(state.q, now.q, v, control, self.control_dt))
+        return Outcome(now, self.observe(now.q, v), torch.where(unsolved, 0.0, reward), terminated, unsolved)
+
+    def set_state(self, q: Tensor, v: Tensor) -> TensorDictBase:
+        """The tensordict of worlds at q `[num_envs, nq]` with velocity v `[num_envs, nv]`, to step on from: the first of an episode.
+        Raises `InputError` for wrong shapes and NaN."""
+        for what, value, width in (("q", q, self.scene.articulation.nq), ("v", v, self.scene.articulation.nv)):
+            if value.shape != (*self.batch_size, width):
+                raise InputError(f"{what} has shape {tuple(value.shape)}: must be {(*self.batch_size, width)}")
+        flat = self._started(q, v)
+        return self._seen(unpacked(flat, self._like), flat)
+
+    def _velocity(self, simulator: Simulator[Any], state: State) -> Tensor:
+        return simulator.integrator.velocity(simulator.articulation, state, simulator.step_size)
+
+    def _of(self, drawn: Mapping[str, Tensor] | None) -> Simulator[Any]:
+        """The simulator of worlds with what they have drawn."""
+        if self.randomization is None or drawn is None:
+            return self.simulator
+        scene = self.randomization.applied(self.scene, {name: drawn[name] for name in ("factors", "push")})
+        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver)
+
+    def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
+        """Packed states at q with v, at the first step of an episode."""
+        worlds = len(q)
+        flat = {"steps": torch.zeros((worlds, 1), dtype=torch.int64, device=q.device)}
+        drawn = None if self.randomization is None else self.randomization.drawn(worlds, self._random)
+        with torch.no_grad():
+            state = self._of(drawn).initial_state(q, v)
+        self._state_like = state
+        return packed(state) | flat | (drawn or {})
+
+    def _fresh(self, worlds: int) -> dict[str, Tensor]:
+        return self._started(*self.start(worlds, self._random))
+
+    def _taken(self, worlds: int) -> dict[str, Tensor]:
+        """As many starts, out of a pool that is filled when it is empty: a solve for many costs little more than one for a few."""
+        have = len(next(iter(self._pool.values()))) if self._pool else 0
+        if have < worlds:
+            made = self._fresh(max(POOL, worlds) if math.prod(self.batch_size) > 1 else 16)
+            self._pool = {name: torch.cat((self._pool[name], x)) for name, x in made.items()} if self._pool else made
+        first = {name: value[:worlds] for name, value in self._pool.items()}
+        self._pool = {name: value[worlds:] for name, value in self._pool.items()}
+        return first
