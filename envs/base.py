@@ -159,10 +159,7 @@ class PbfdEnv(EnvBase):
         shape, device = self.batch_size, self.device
         width = self.observe(self.setup.q[:1], self.setup.v[:1]).shape[-1]
         state = Composite(
-            {
-                name: Unbounded((*shape, *value.shape[1:]), dtype=value.dtype, device=device)
-                for name, value in start.items()
-            },
+            {name: Unbounded((*shape, *value.shape[1:]), dtype=value.dtype, device=device) for name, value in start.items()},
             shape=shape,
         )
         self.observation_spec = Composite(

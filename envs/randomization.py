@@ -70,9 +70,7 @@ class Randomization:
         """The scene of the worlds with what was drawn for them."""
         a = scene.articulation
         mass, friction, gain = drawn["factors"].to(a.dtype).unbind(-1)
-        terms = [
-            replaced(term, gear=term.gear * gain[:, None]) if isinstance(term, Actuators) else term for term in scene.terms
-        ]
+        terms = [replaced(term, gear=term.gear * gain[:, None]) if isinstance(term, Actuators) else term for term in scene.terms]
         if self.push > 0:
             force = torch.zeros((len(mass), a.nlink, 3), dtype=a.dtype, device=a.device)
             force[:, 0] = drawn["push"].to(a.dtype)

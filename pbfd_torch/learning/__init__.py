@@ -1,0 +1,1 @@
+"""Trains controllers in the environments, by PPO and by the simulator's own gradients, and evaluates them elsewhere."""

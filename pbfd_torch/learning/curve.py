@@ -1,0 +1,82 @@
+"""The learning curve: one row per batch as CSV, and its picture."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a batch has shown.
+
+    Attributes:
+        frames: environment steps so far.
+        seconds: of training so far.
+        episodes: that ended in this batch.
+        mean_return, lowest_return, highest_return, mean_length: of these; NaN where there are none.
+        reward: mean per step.
+        unsolved: share of steps without a solution.
+        loss: of the last update.
+    """
+
+    frames: int
+    seconds: float
+    episodes: int
+    mean_return: float
+    lowest_return: float
+    highest_return: float
+    mean_length: float
+    reward: float
+    unsolved: float
+    loss: float
+
+
+def save(rows: Sequence[Row], path: Path) -> None:
+    """The whole curve, or the old file stays."""
+    part = path.with_suffix(".part")
+    with part.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(Row.__dataclass_fields__))
+        writer.writeheader()
+        writer.writerows(
+            {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in asdict(r).items()} for r in rows
+        )
+    os.replace(part, path)
+
+
+def load(path: Path) -> list[Row]:
+    """What `save` wrote."""
+    with path.open(newline="") as file:
+        return [
+            Row(**{k: int(v) if k in ("frames", "episodes") else float(v) for k, v in row.items()}) for row in csv.DictReader(file)
+        ]
+
+
+def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
+    """Mean return over environment steps and over time, each curve with the range of its episodes."""
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), dpi=130, layout="constrained", sharey=True)
+    for k, (name, rows) in enumerate(curves.items()):
+        ended = [row for row in rows if row.episodes]
+        if not ended:
+            continue
+        values = np.array([row.mean_return for row in ended])
+        low, high = (np.array([getattr(row, what) for row in ended]) for what in ("lowest_return", "highest_return"))
+        for axis, x in zip(axes, ([r.frames for r in ended], [r.seconds / 60 for r in ended]), strict=True):
+            axis.plot(x, values, color=f"C{k}", label=name)
+            axis.fill_between(x, low, high, color=f"C{k}", alpha=0.15, linewidth=0)
+    axes[0].set(xlabel="environment steps", ylabel="return of finished episodes", title=title)
+    axes[1].set(xlabel="minutes of training")
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    axes[0].legend(loc="upper left")
+    figure.savefig(path)
+    plt.close(figure)
