@@ -24,6 +24,7 @@ from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.terms.actuators import Actuators
 
+DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
 POOL = 256  # starts that are made at once, at least: each costs a solve
 
 
@@ -220,9 +221,9 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             outcome = self.advanced(unpacked(flat, self._like), action, flat)
         steps = flat["steps"] + 1
         truncated = (steps >= self.max_episode_steps) & ~outcome.terminated[:, None]
-        state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in ("factors", "push") if name in flat}
+        state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in DRAWN if name in flat}
         if self.randomization is not None:
-            state["push"] = self.randomization.pushed(flat["push"], self._random)
+            state["world_push"] = self.randomization.pushed(flat["world_push"], self._random)
         return TensorDict(
             {
                 "observation": outcome.observation.float(),
@@ -274,7 +275,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         """The simulator of worlds with what they have drawn."""
         if self.randomization is None or drawn is None:
             return self.simulator
-        scene = self.randomization.applied(self.scene, {name: drawn[name] for name in ("factors", "push")})
+        scene = self.randomization.applied(self.scene, {name: drawn[name] for name in DRAWN})
         return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver)
 
     def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:

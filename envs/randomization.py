@@ -52,7 +52,7 @@ class Randomization:
         """Factors of mass, friction and gain `[worlds, 3]`, and no push yet, `[worlds, 3]` [N]."""
         low, high = torch.tensor([self.mass, self.friction, self.gain], dtype=torch.float64, device=random.device).unbind(-1)
         share = torch.rand(worlds, 3, generator=random, dtype=torch.float64, device=random.device)
-        return {"factors": low + (high - low) * share, "push": torch.zeros_like(share)}
+        return {"world_factors": low + (high - low) * share, "world_push": torch.zeros_like(share)}
 
     def pushed(self, push: Tensor, random: torch.Generator) -> Tensor:
         """The pushes of the next control step: in some worlds one begins, or ends."""
@@ -69,11 +69,11 @@ class Randomization:
     def applied(self, scene: Scene, drawn: dict[str, Tensor]) -> Scene:
         """The scene of the worlds with what was drawn for them."""
         a = scene.articulation
-        mass, friction, gain = drawn["factors"].to(a.dtype).unbind(-1)
+        mass, friction, gain = drawn["world_factors"].to(a.dtype).unbind(-1)
         terms = [replaced(term, gear=term.gear * gain[:, None]) if isinstance(term, Actuators) else term for term in scene.terms]
         if self.push > 0:
             force = torch.zeros((len(mass), a.nlink, 3), dtype=a.dtype, device=a.device)
-            force[:, 0] = drawn["push"].to(a.dtype)
+            force[:, 0] = drawn["world_push"].to(a.dtype)
             terms.append(Pushes.at_centers(a, force))
         scaled = replaced(a, pseudo_inertia=a.pseudo_inertia * mass[:, None, None, None])
         scene = replaced(scene, articulation=scaled, terms=tuple(terms))

@@ -12,7 +12,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The Python blocks print solved steps, write the rollout that they name, print the derivative that they say, and show the rollout."""
+    """The Python blocks print solved steps, write the rollout that they name, print the derivative that they say, and show it."""
     example, derivative, shown = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len(example.strip().splitlines()) <= 16
     monkeypatch.chdir(tmp_path)

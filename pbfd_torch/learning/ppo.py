@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -75,7 +76,8 @@ class PpoTrainer:
             self.actor, self.critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy, normalize_advantage=True
         )
         self.optimiser = torch.optim.Adam(self.loss.parameters(), settings.learning_rate, eps=1e-5)
-        self.shared = statistics(settings.env)
+        self._memory = tempfile.TemporaryDirectory(prefix="pbfd-statistics-")
+        self.shared = statistics(settings.env, Path(self._memory.name))
         if self.folder.saved is not None:
             self._restore(self.folder.saved)
 
@@ -90,11 +92,14 @@ class PpoTrainer:
 
     def _collector(self) -> Any:
         s = self.settings
-        makers = [functools.partial(training_env, s.env, k, self.shared, bool(s.ray)) for k in range(max(s.workers, s.ray))]
+        makers = [
+            functools.partial(training_env, s.env, k, Path(self._memory.name), bool(s.ray)) for k in range(max(s.workers, s.ray))
+        ]
         common: dict[str, Any] = {"frames_per_batch": s.frames_per_batch, "total_frames": -1}
         if s.ray:
             from torchrl.collectors.distributed import RayCollector
 
+            common["total_frames"] = 10**12  # it knows no endless collecting
             return RayCollector(makers, self.actor, sync=True, num_collectors=s.ray, update_after_each_batch=True, **common)
         if s.workers > 1:
             return MultiSyncCollector(makers, self.actor, cat_results=0, update_at_each_batch=True, num_threads=1, **common)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -83,7 +84,8 @@ class ShacTrainer:
         self.target = copy.deepcopy(self.critic)
         self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, betas=(0.7, 0.95))
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, betas=(0.7, 0.95))
-        self.shared = statistics(settings.env)
+        self._memory = tempfile.TemporaryDirectory(prefix="pbfd-statistics-")
+        self.shared = statistics(settings.env, Path(self._memory.name))
         self._parts = {"actor": self.actor, "critic": self.critic, "target": self.target}
         self._parts |= {"actor_optimiser": self.actor_optimiser, "critic_optimiser": self.critic_optimiser}
         if self.folder.saved is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -29,10 +30,11 @@ class EnvSettings:
     dtype: str = "float64"
     control_dt: float | None = None
     dt: float | None = None
+    max_episode_steps: int | None = None
 
     def make(self, **changes: Any) -> Any:
         """The environment itself."""
-        given = {"num_envs": self.num_envs, "seed": self.seed, "control_dt": self.control_dt, "dt": self.dt}
+        given = {name: value for name, value in asdict(self).items() if name not in ("name", "dtype")}
         return make_env(self.name, dtype=getattr(torch, self.dtype), **(given | changes))
 
 
@@ -62,21 +64,20 @@ def plain(statistics: TensorDictBase) -> dict[str, dict[str, Tensor]]:
     return {name: {k: v.clone() for k, v in statistics[name].items()} for name in ("loc", "var", "count")}
 
 
-def training_env(
-    settings: EnvSettings, worker: int = 0, shared: TensorDictBase | None = None, frozen: bool = False
-) -> TransformedEnv:
-    """The environment of one worker; its seed follows from the settings' and the worker's number."""
-    norm = normaliser(shared)
+def training_env(settings: EnvSettings, worker: int = 0, shared: Path | None = None, frozen: bool = False) -> TransformedEnv:
+    """The environment of one worker; its seed follows from the settings' and the worker's number. shared: folder of the `statistics`
+    that all workers see and add to; frozen: that they only see."""
+    norm = normaliser(None if shared is None else TensorDict.load_memmap(shared))
     if frozen:
         norm.freeze()
     env = settings.make(seed=settings.seed + 1000 * worker)
     return TransformedEnv(env, Compose(norm, RewardSum(), StepCounter()))
 
 
-def statistics(settings: EnvSettings, steps: int = 8) -> TensorDict:
-    """Mean and variance of what is observed in the first steps of random actions, in shared memory."""
+def statistics(settings: EnvSettings, folder: Path, steps: int = 8) -> TensorDict:
+    """Mean and variance of what is observed in the first steps of random actions, as files in a folder that processes share."""
     env = TransformedEnv(settings.make(num_envs=min(settings.num_envs, 256)), normaliser())
     env.rollout(steps, break_when_any_done=False)
     norm = env.transform
     found = TensorDict({"loc": norm._loc, "var": norm._var, "count": norm._count})
-    return found.clone().share_memory_()
+    return found.clone().memmap(folder)
