@@ -13,7 +13,7 @@ from pbfd_torch.bench.precision_reference import chain_tips, middle_axes
 from pbfd_torch.bench.precision_tracks import Track, rms
 from pbfd_torch.models import SCENES, Setup, boxes, chains
 
-HELD = 0.02  # [s] for which a control is held
+FRAME = 0.1  # [s] for which a control is held; the longest step of the adaptive runs
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,16 @@ class Case:
         """Worlds that the error is taken over: the box slides under every μ."""
         return len(boxes.SLIDING_FRICTION) if self.scene == "box-slide" else 1
 
-    @property
-    def frame(self) -> float:
-        """The longest step of the adaptive runs [s]."""
-        return 0.1 if self.control is None else HELD
-
     def setup(self, worlds: int) -> Setup:
         """The scene, world k like world k modulo `tracked_worlds`."""
         return SCENES[self.scene](worlds=worlds)
 
     def controls(self, dt: float, start: Tensor) -> Tensor | None:
-        """`[*, nu]` of the steps of length dt that begin at the times `[*]`. It is held for `HELD`, as it is in the middle of that,
-        so that all steps that are no longer see the same control."""
+        """`[*, nu]` of the steps of length dt ≤ `FRAME` that begin at the times `[*]`. It is held for `FRAME`, as it is in the
+        middle of that, so that steps of all lengths see the same control."""
         if self.control is None:
             return None
-        held = max(HELD, dt)
-        return self.control(held * (torch.floor((start + 0.5 * dt) / held) + 0.5))
+        return self.control(FRAME * (torch.floor((start + 0.5 * dt) / FRAME) + 0.5))
 
     def error(self, track: Track, reference: Tensor) -> float:
         """In `unit`; NaN where the motion is not finite."""
