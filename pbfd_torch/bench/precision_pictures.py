@@ -60,6 +60,7 @@ def draw_steps(report: Mapping[str, Any], path: Path) -> None:
                 axes.plot(failed, [height] * len(failed), color=style["color"], marker="x", linestyle="", transform=top)
                 height -= 0.05
         axes.set_xlabel("Δt [s], mean of the adaptive runs'")
+        axes.margins(y=0.2)  # room for the crosses
 
     _figure(report, panel, "Error against time step (crosses: diverged or unsolved)", path)
 
