@@ -160,6 +160,37 @@ def test_reference_of_the_body_agrees_with_mujoco() -> None:
     assert rms(middle_axis(track)[:, 0] - middle_axes(25, 1e-3)) < 1e-6
 
 
+def test_own_reference_is_told_with_its_change() -> None:
+    """A motion that is off by dt metres: the value at dt, and the uncertainty dt; an exact reference is taken as it is."""
+    case = CASES["hopper"]
+    start = case.setup(1).q
+
+    def motion(dt: float, duration: float) -> Track:
+        q = start.expand(round(duration / 0.1) + 1, 1, -1).clone()
+        q[..., 0] += dt
+        return Track.of_states(case.setup(1).scene, tenths(duration, 0.0), q, torch.zeros(*q.shape[:2], 6, dtype=torch.float64))
+
+    found = precision.reference_of(case, "x", 0.01, motion)
+    at_rest = case.observe(motion(0.0, case.duration))
+    assert rms(found.value - at_rest) == pytest.approx(0.01)
+    assert found.uncertainty == pytest.approx(0.01)
+    assert found.source == "x at 0.01 s"
+    exact = precision.our_reference(CASES["chain-slope-drop"], 0.01)
+    assert (float(exact.value), exact.uncertainty) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("dt", [0.0001, *precision.FULL.steps])
+def test_steps_of_all_lengths_see_the_same_control(dt: float) -> None:
+    """Ten values a second, those of the sine in the middle of each tenth; zero where there is no control."""
+    case, count = CASES["walker"], round(1.0 / dt)
+    controls = case.controls(dt, dt * torch.arange(count, dtype=torch.float64))
+    assert controls is not None
+    middle = torch.arange(10, dtype=torch.float64)[:, None] / 10 + 0.05
+    should = 0.1 * torch.sin(2 * math.pi * middle + torch.arange(6))
+    np.testing.assert_allclose(controls.numpy(), should.repeat_interleave(count // 10, 0).numpy(), atol=1e-12)
+    assert CASES["chain-free"].controls(dt, torch.zeros(3)) is None
+
+
 # Errors -------------------------------------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +17,9 @@ from torch import Tensor
 
 from pbfd_torch.adaptive import AdaptiveSimulator
 from pbfd_torch.bench import mujoco_runs
-from pbfd_torch.bench.precision_scenes import CASES, Case
+from pbfd_torch.bench.precision_scenes import CASES, FRAME, Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.timing import Progress
-from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.rollout import Rollout
@@ -28,6 +27,7 @@ from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 
 OURS, PEER, ADAPTIVE = "pbfd_torch", "MuJoCo", "adaptive"
+OWN, OWN_PEER = "energy-momentum", "RK4"  # the integrators that are references, each of its own simulator
 SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
 NOTES = (
     "error: root mean square of the distance from the reference over what is observed; Δt: held to it, but for `adaptive`",
@@ -45,8 +45,8 @@ NOTES = (
         "files have them"
     ),
     (
-        "where the reference is each simulator's own, contact models differ and so do the motions: ours is the integrator that "
-        "changes least as its step is halved, MuJoCo's is RK4; ±: by how much it still changed, and no error below that counts"
+        f"where the reference is each simulator's own, contact models differ and so do the motions: ours is {OWN}, MuJoCo's is "
+        f"{OWN_PEER}; ±: by how much it still changed as its step was halved, and no error below that counts"
     ),
     "diverged: MuJoCo found a bad state, or ours is not finite; unsolved: steps that ours left without a root",
     "an error counts as reached where all steps are solved and the energy rises by no more than .1 of the largest kinetic energy",
@@ -70,7 +70,7 @@ class Effort:
 
     steps: tuple[float, ...] = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
     peer_steps: tuple[float, ...] = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
-    own_step: float = 0.001
+    own_step: float = 0.0005
     own_peer_step: float = 0.0001
     worlds: int = 256
     seconds: tuple[float, float] = (0.4, 0.6)
@@ -85,11 +85,11 @@ class Effort:
 
     def accuracies_with(self, integrators: Sequence[str]) -> tuple[float, ...]:
         """Those of the adaptive runs, which are the default integrator's, beside these [m]."""
-        return self.accuracies if EnergyMomentum in map(INTEGRATORS.get, integrators) else ()
+        return self.accuracies if OWN in integrators else ()
 
     def units(self, case: Case, integrators: Sequence[str], peers: Sequence[str]) -> int:
         """How often `measure_scene` tells its progress."""
-        ours = len(integrators) * (2 * len(self.steps_of(case)) + (2 if case.exact is None else 0))
+        ours = 2 * len(integrators) * len(self.steps_of(case))
         return ours + len(peers) * len(self.peer_steps) + len(self.accuracies_with(integrators))
 
 
@@ -182,25 +182,24 @@ def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: in
     return 1e3 * sum(each) / groups / motion.dt / worlds
 
 
-def our_reference(case: Case, fine: Sequence[Motion], coarse: Sequence[Motion]) -> Reference:
-    """The finest motion of the integrator that changed least from twice its step; exact where that is known."""
-    if case.exact is not None:
-        return Reference(case.exact())
-    found = []
-    for best, other in zip(fine, coarse, strict=True):
-        value = case.observe(best.track)
-        change = case.error(other.track, value)
-        found.append(Reference(value, change if math.isfinite(change) else math.inf, f"{best.integrator} at {best.dt:g} s"))
-    return min(found, key=lambda reference: reference.uncertainty)
-
-
-def peer_reference(case: Case, dt: float) -> Reference:
-    """RK4's at dt, and how far it is from that at twice the step; exact where that is known."""
+def reference_of(case: Case, integrator: str, dt: float, motion: Callable[[float, float], Track]) -> Reference:
+    """What the motion (dt, duration) → track gives, and how far that is from what it gives at twice the step; exact where that is
+    known."""
     if case.exact is not None:
         return Reference(case.exact())
     until = min(case.duration, case.observed_s)
-    value = case.observe(peer_motion(case, "RK4", dt, until)[0])
-    return Reference(value, case.error(peer_motion(case, "RK4", 2 * dt, until)[0], value), f"RK4 at {dt:g} s")
+    value = case.observe(motion(dt, until))
+    return Reference(value, case.error(motion(2 * dt, until), value), f"{integrator} at {dt:g} s")
+
+
+def our_reference(case: Case, dt: float) -> Reference:
+    """The default integrator's at dt."""
+    return reference_of(case, OWN, dt, lambda *args: our_motion(case, OWN, *args).track)
+
+
+def peer_reference(case: Case, dt: float) -> Reference:
+    """RK4's at dt."""
+    return reference_of(case, OWN_PEER, dt, lambda *args: peer_motion(case, OWN_PEER, *args)[0])
 
 
 def our_row(case: Case, motion: Motion, reference: Reference, other: Reference | None, effort: Effort) -> dict[str, Any]:
@@ -222,9 +221,9 @@ def our_row(case: Case, motion: Motion, reference: Reference, other: Reference |
 def adaptive_row(case: Case, accuracy: float, reference: Reference) -> dict[str, Any]:
     """One run with steps of the worlds' own."""
     setup = case.setup(case.tracked_worlds)
-    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, case.frame, accuracy)
-    frames = step_count(case.duration, case.frame)
-    controls = case.controls(case.frame, case.frame * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
+    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, FRAME, accuracy)
+    frames = step_count(case.duration, FRAME)
+    controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
     began = time.perf_counter()
     rollout = simulator.rollout(start, controls, frames if controls is None else None)
@@ -279,16 +278,12 @@ def measure_scene(
     case: Case, integrators: Sequence[str], peers: Sequence[str], effort: Effort, progress: Progress
 ) -> dict[str, Any]:
     """All rows of one scene as plain data. peers: MuJoCo's integrators; none: without MuJoCo."""
-
-    def recorded(name: str, dt: float, duration: float) -> Motion:
-        progress(1)
-        return our_motion(case, name, dt, duration)
-
-    until = min(case.duration, case.observed_s)
-    own = (effort.own_step, 2 * effort.own_step) if case.exact is None else ()
-    fine, coarse = ([recorded(name, dt, until) for name in integrators] for dt in own) if own else ([], [])
-    motions = [recorded(name, dt, case.duration) for name in integrators for dt in effort.steps_of(case)]
-    reference = our_reference(case, fine, coarse)
+    motions = []
+    for name in integrators:
+        for dt in effort.steps_of(case):
+            motions.append(our_motion(case, name, dt, case.duration))
+            progress(1)
+    reference = our_reference(case, effort.own_step)
     other = peer_reference(case, effort.own_peer_step) if peers else None
     rows = []
     for motion in motions:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +15,16 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from pbfd_torch.bench.precision import ADAPTIVE, OURS, PEER
+from pbfd_torch.bench.precision import ADAPTIVE, PEER
 from pbfd_torch.bench.precision_levels import Row, batch_of
 
 FLOOR = 1e-12  # smaller errors are drawn here
-COLORS = ("#440154", "#e8a400", "#35b779", "#d62728", "#7f3fbf", "#8c564b", "#17becf")  # ours
+COLORS = ("#000000", "#e8a400", "#2ca02c", "#d62728", "#8c564b", "#17becf")  # ours
+ADAPTIVE_STYLE: Mapping[str, Any] = {"color": "#c000c0", "marker": "*"}
 PEER_STYLES: Mapping[str, dict[str, Any]] = {
     "Euler": {"color": "0.65", "marker": "s"},
     "implicitfast": {"color": "0.4", "marker": "^"},
-    "RK4": {"color": "#31688e", "marker": "D"},
+    "RK4": {"color": "#1f77b4", "marker": "D"},
 }
 
 
@@ -41,19 +42,25 @@ def draw_work(report: Mapping[str, Any], path: Path) -> None:
             _curve(axes, rows, lambda row: row["ms_per_s"]["1"], style | {"alpha": 0.35, "linestyle": "--"})
         axes.set_xlabel("wall ms per simulated s and world")
 
-    _figure(report, panel, "Work and precision: one thread, float64; lower left is better", path)
+    batch = Line2D([], [], color="0.3", label=f"ours: {report['worlds']} worlds")
+    alone = Line2D([], [], color="0.3", linestyle="--", alpha=0.5, label="ours: 1 world")
+    _figure(report, panel, "Work and precision: one thread, float64; lower left is better", path, (batch, alone))
 
 
 def draw_steps(report: Mapping[str, Any], path: Path) -> None:
-    """Error against time step; crosses at the top: diverged, or left unsolved. Raises `OSError`."""
+    """Error against time step; crosses at the top: diverged, or left unsolved, a line of them for each integrator. Raises
+    `OSError`."""
 
     def panel(axes: Axes, scene: Mapping[str, Any]) -> None:
+        height = 0.97  # of the axes
         for rows, style in _curves(scene, report["integrators"]).values():
             _curve(axes, rows, lambda row: row["dt"], style)
-            failed = [row["dt"] for row in rows if row["diverged"] or row["unsolved_steps"]]
-            top = axes.get_xaxis_transform()
-            axes.plot(failed, [0.97] * len(failed), color=style["color"], marker="x", linestyle="", transform=top)
-        axes.set_xlabel("Δt [s]")
+            if failed := [row["dt"] for row in rows if row["diverged"] or row["unsolved_steps"]]:
+                top = axes.get_xaxis_transform()
+                axes.plot(failed, [height] * len(failed), color=style["color"], marker="x", linestyle="", transform=top)
+                height -= 0.05
+        axes.set_xlabel("Δt [s], mean of the adaptive runs'")
+        axes.margins(y=0.2)  # room for the crosses
 
     _figure(report, panel, "Error against time step (crosses: diverged or unsolved)", path)
 
@@ -66,9 +73,16 @@ def _curves(scene: Mapping[str, Any], integrators: list[str]) -> Curves:
     found: Curves = {}
     for row in scene["rows"]:
         name = (row["simulator"], row["integrator"])
-        ours = {"color": COLORS[[*integrators, ADAPTIVE].index(name[1]) % len(COLORS)], "marker": "o"} if name[0] == OURS else {}
-        found.setdefault(name, ([], ours or dict(PEER_STYLES[name[1]])))[0].append(row)
+        found.setdefault(name, ([], _style(*name, integrators)))[0].append(row)
     return found
+
+
+def _style(simulator: str, integrator: str, integrators: list[str]) -> dict[str, Any]:
+    if simulator == PEER:
+        return dict(PEER_STYLES[integrator])
+    if integrator == ADAPTIVE:
+        return dict(ADAPTIVE_STYLE)
+    return {"color": COLORS[integrators.index(integrator) % len(COLORS)], "marker": "o"}
 
 
 def _curve(axes: Axes, rows: list[Row], along: Callable[[Row], float], style: Mapping[str, Any]) -> None:
@@ -77,7 +91,13 @@ def _curve(axes: Axes, rows: list[Row], along: Callable[[Row], float], style: Ma
     axes.plot([along(row) for row in shown], errors, **{"markersize": 4, "linewidth": 1.3, **style})
 
 
-def _figure(report: Mapping[str, Any], panel: Callable[[Axes, Mapping[str, Any]], None], title: str, path: Path) -> None:
+def _figure(
+    report: Mapping[str, Any],
+    panel: Callable[[Axes, Mapping[str, Any]], None],
+    title: str,
+    path: Path,
+    lines: Sequence[Line2D] = (),
+) -> None:
     scenes = report["scenes"]
     across = min(3, len(scenes))
     down = math.ceil(len(scenes) / across)
@@ -94,8 +114,7 @@ def _figure(report: Mapping[str, Any], panel: Callable[[Axes, Mapping[str, Any]]
             axes.axhline(max(FLOOR, own["uncertainty"]), color="0.6", linewidth=0.8, linestyle=":")
     styles = {name: style for scene in scenes.values() for name, (_, style) in _curves(scene, report["integrators"]).items()}
     handles = [Line2D([], [], label=" ".join(name), markersize=5, **style) for name, style in styles.items()]
-    handles.append(Line2D([], [], color="0.3", label=f"ours: {report['worlds']} worlds"))
-    handles.append(Line2D([], [], color="0.3", linestyle="--", alpha=0.5, label="ours: 1 world"))
+    handles += lines
     handles.append(Line2D([], [], color="0.6", linestyle=":", label="± of a reference of its own"))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(title, fontsize=13)
