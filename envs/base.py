@@ -63,12 +63,12 @@ class Outcome:
     unsolved: Tensor
 
 
-class PbfdEnv(EnvBase):
+class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
     """A batch `[num_envs]` of worlds. Subclasses say what the scene is, what is seen, and what is good.
 
     The tensordict holds "observation" (float32), "action" (float32, from −1 to 1 or the actuators' range), "reward", "done",
-    "terminated", "truncated", "unsolved", and "state": the integrator's state, the step count and, with a `randomization`, what each
-    world has drawn. Nothing else is remembered, so any tensordict of an earlier step can be gone on from.
+    "terminated", "truncated", "unsolved", and "state": the integrator's state, the step count and, with a `randomization`, what
+    each world has drawn. Nothing else is remembered, so any tensordict of an earlier step can be gone on from.
 
     Arguments:
         num_envs: worlds ≥ 1. device, dtype (float64 or float32): of the simulation.
@@ -185,8 +185,8 @@ class PbfdEnv(EnvBase):
         self._pool: dict[str, Tensor] = {}
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any) -> TensorDictBase:
-        if set_state and tensordict is not None and "state" in tensordict.keys():
-            state = {name: value for name, value in tensordict["state"].items()}
+        if set_state and tensordict is not None and "state" in tensordict:
+            state = dict(tensordict["state"].items())
             return self._seen(unpacked(state, self._like), state)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         where = torch.ones(self.batch_size, dtype=torch.bool, device=self.device) if mask is None else mask.reshape(self.batch_size)
@@ -241,8 +241,8 @@ class PbfdEnv(EnvBase):
     # the simulation's side -------------------------------------------------------------------------------------------
 
     def advanced(self, state: State, action: Tensor, drawn: Mapping[str, Tensor] | None = None) -> Outcome:
-        """A control step from a state under an action `[worlds, nu]`, with derivatives where these carry any. drawn: what the worlds
-        of a `randomization` have drawn, as in the tensordict's "state"."""
+        """A control step from a state under an action `[worlds, nu]`, with derivatives where these carry any. drawn: what the
+        worlds of a `randomization` have drawn, as in the tensordict's "state"."""
         simulator = self._of(drawn)
         bad = torch.isnan(action).any(-1)
         control = torch.where(bad[:, None], 0.0, action).to(self.scene.articulation.dtype).clamp(self._low, self._high)
@@ -260,8 +260,8 @@ class PbfdEnv(EnvBase):
         return Outcome(now, self.observe(now.q, v), torch.where(unsolved, 0.0, reward), terminated, unsolved)
 
     def set_state(self, q: Tensor, v: Tensor) -> TensorDictBase:
-        """The tensordict of worlds at q `[num_envs, nq]` with velocity v `[num_envs, nv]`, to step on from: the first of an episode.
-        Raises `InputError` for wrong shapes and NaN."""
+        """The tensordict of worlds at q `[num_envs, nq]` with velocity v `[num_envs, nv]`, to step on from: the first of an
+        episode. Raises `InputError` for wrong shapes and NaN."""
         for what, value, width in (("q", q, self.scene.articulation.nq), ("v", v, self.scene.articulation.nv)):
             if value.shape != (*self.batch_size, width):
                 raise InputError(f"{what} has shape {tuple(value.shape)}: must be {(*self.batch_size, width)}")

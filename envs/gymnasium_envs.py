@@ -53,6 +53,8 @@ class PbfdGymEnv(gymnasium.Env[Array, Array]):
         from pbfd_torch.envs.named import make_env
 
         self.env = make_env(name, num_envs=1, **arguments)
+        self.observation_space: Any
+        self.action_space: Any
         self.observation_space, self.action_space = _spaces(self.env)
         self.render_mode = render_mode
         self._now: Any = None

@@ -13,9 +13,9 @@ FASTEST = 10.0  # of observed velocities [m/s, rad/s]
 
 
 class HopperEnv(PbfdEnv):
-    """Observation `[11]`: height and pitch of the torso, three joint angles, all six velocities, clipped to ±10. Action `[3]`: torques
-    from −1 to 1, times 200 N m. Reward: forward velocity over the step + 1 while healthy − 1e-3 ‖action‖². Healthy: height above .7,
-    |pitch| < .2, everything but x within ±100."""
+    """Observation `[11]`: height and pitch of the torso, three joint angles, all six velocities, clipped to ±10. Action `[3]`:
+    torques from −1 to 1, times 200 N m. Reward: forward velocity over the step + 1 while healthy − 1e-3 ‖action‖². Healthy: height
+    above .7, |pitch| < .2, everything but x within ±100."""
 
     def make_setup(self, dtype: torch.dtype, device: torch.device) -> Setup:
         return hopper(1, dtype, device)

@@ -15,9 +15,9 @@ UPPER, LOWER = 0.35, 0.3
 
 
 class PushBoxEnv(PbfdEnv):
-    """Observation `[14]`: cosine and sine of both angles, their speeds, hand, box and way from the box to the goal [m] in the plane,
-    and the box's velocity. Action `[2]`: torques from −1 to 1, times 8 N m. Reward: −the box's distance from the goal − .2 that of
-    the hand from the box [m] − .01 ‖action‖². Healthy: the box on the table, within 1 m."""
+    """Observation `[14]`: cosine and sine of both angles, their speeds, hand, box and way from the box to the goal [m] in the
+    plane, and the box's velocity. Action `[2]`: torques from −1 to 1, times 8 N m. Reward: −the box's distance from the goal − .2
+    that of the hand from the box [m] − .01 ‖action‖². Healthy: the box on the table, within 1 m."""
 
     task_dt = 0.02
     task_steps = 150

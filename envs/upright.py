@@ -18,9 +18,10 @@ FASTEST = 10.0  # of observed velocities [m/s, rad/s]
 
 
 class UprightEnv(PbfdEnv):
-    """A robot whose free base comes first in q. Observation: height and the world's vertical as the torso sees it, joint angles, the
-    torso's velocity and spin in its own axes, joint velocities, all clipped to ±10. Reward: forward velocity, at most `fastest`, + 1
-    while healthy − ½ the sideways velocity − 1e-3 ‖action‖². Healthy: height above `lowest`, the torso within 1 rad of upright."""
+    """A robot whose free base comes first in q. Observation: height and the world's vertical as the torso sees it, joint angles,
+    the torso's velocity and spin in its own axes, joint velocities, all clipped to ±10. Reward: forward velocity, at most
+    `fastest`, + 1 while healthy − ½ the sideways velocity − 1e-3 ‖action‖². Healthy: height above `lowest`, the torso within 1 rad
+    of upright."""
 
     file = ""
     lowest = 0.8

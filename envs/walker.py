@@ -12,9 +12,9 @@ from pbfd_torch.models.setup import Setup
 
 
 class WalkerEnv(PbfdEnv):
-    """Observation `[17]`: height and pitch of the torso, six joint angles, all nine velocities, clipped to ±10. Action `[6]`: torques
-    from −1 to 1, times 100 N m. Reward: forward velocity over the step + 1 while healthy − 1e-3 ‖action‖². Healthy: height from .8 to
-    2, |pitch| < 1."""
+    """Observation `[17]`: height and pitch of the torso, six joint angles, all nine velocities, clipped to ±10. Action `[6]`:
+    torques from −1 to 1, times 100 N m. Reward: forward velocity over the step + 1 while healthy − 1e-3 ‖action‖². Healthy: height
+    from .8 to 2, |pitch| < 1."""
 
     def make_setup(self, dtype: torch.dtype, device: torch.device) -> Setup:
         return walker(1, dtype, device)

@@ -1,4 +1,4 @@
-"""The `pbfd` command: simulate, view, optimize, info, scenes, demo, bench."""
+"""The `pbfd` command: simulate, view, train, evaluate, optimize, info, scenes, demo, bench."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from pbfd_torch.cli.bench_hard_cases import hard_cases
 from pbfd_torch.cli.bench_precision import precision
 from pbfd_torch.cli.bench_slope import slope
 from pbfd_torch.cli.bench_solvers import solvers
+from pbfd_torch.cli.evaluate import evaluate
 from pbfd_torch.cli.optimize import optimize
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
+from pbfd_torch.cli.train import train
 from pbfd_torch.cli.view import view
 from pbfd_torch.errors import NotModelledWarning, PbfdError
 
@@ -35,6 +37,8 @@ bench.command()(slope)
 app.add_typer(bench, name="bench")
 app.command()(optimize)
 app.command()(view)
+app.command()(train)
+app.command()(evaluate)
 
 _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scenes` lists the names.", show_default=False)
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -56,9 +57,12 @@ def save(rows: Sequence[Row], path: Path) -> None:
 def load(path: Path) -> list[Row]:
     """What `save` wrote."""
     with path.open(newline="") as file:
-        return [
-            Row(**{k: int(v) if k in ("frames", "episodes") else float(v) for k, v in row.items()}) for row in csv.DictReader(file)
-        ]
+        return [_row(row) for row in csv.DictReader(file)]
+
+
+def _row(row: Mapping[str, str]) -> Row:
+    numbers: dict[str, Any] = {k: int(v) if k in ("frames", "episodes") else float(v) for k, v in row.items()}
+    return Row(**numbers)
 
 
 def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:

@@ -15,15 +15,14 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.envs import PbfdEnv, Step
+from pbfd_torch.learning.folder import load_checkpoint
 from pbfd_torch.learning.networks import make_actor, mean_action
-from pbfd_torch.learning.ppo import load_checkpoint
 from pbfd_torch.learning.track import tracked
-from pbfd_torch.learning.training_env import EnvSettings
+from pbfd_torch.learning.training_env import EnvSettings, location_and_scale
 from pbfd_torch.learning.worlds import trial_worlds
 from pbfd_torch.rollout import Rollout
 
 SHOWN = 4  # worlds in a saved rollout
-_EPS = 1e-4  # as the normaliser has it
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +32,7 @@ class Policy:
     settings: EnvSettings
     actor: Any
     loc: Tensor
-    var: Tensor
+    scale: Tensor
 
     @staticmethod
     def load(path: Path) -> Policy:
@@ -43,14 +42,12 @@ class Policy:
         probe = settings.make(num_envs=1)
         actor = make_actor(probe.observation_spec["observation"].shape[-1], probe.action_spec, saved["settings"]["width"])
         actor.load_state_dict(saved["actor"])
-        loc, var = (saved["statistics"][name]["observation"] for name in ("loc", "var"))
-        return Policy(settings, actor, loc, var)
+        return Policy(settings, actor, *location_and_scale(saved["statistics"]))
 
     def __call__(self, observation: Tensor) -> Tensor:
         """`[worlds, nobs] → [worlds, nu]`."""
-        seen = (observation.float() - self.loc) / (self.var - self.loc.square()).sqrt().clamp_min(_EPS)
         with torch.no_grad():
-            return mean_action(self.actor, seen)
+            return mean_action(self.actor, (observation.float() - self.loc) / self.scale)
 
 
 @dataclass(frozen=True, eq=False)

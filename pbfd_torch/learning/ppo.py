@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -19,11 +18,9 @@ from torchrl.objectives.value import GAE
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.learning import curve
+from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
-from pbfd_torch.learning.training_env import EnvSettings, statistics, training_env
-
-FORMAT = "pbfd_torch policy 1"
-CHECKPOINT, CURVE, PICTURE = "checkpoint.pt", "curve.csv", "curve.png"
+from pbfd_torch.learning.training_env import EnvSettings, plain, statistics, training_env
 
 
 @dataclass(frozen=True)
@@ -36,14 +33,14 @@ class Ppo:
     """
 
     env: EnvSettings
-    horizon: int = 16
-    epochs: int = 6
-    minibatch: int = 4096
-    learning_rate: float = 5e-4
+    horizon: int = 32
+    epochs: int = 10
+    minibatch: int = 2048
+    learning_rate: float = 3e-4
     gamma: float = 0.99
     lmbda: float = 0.95
     clip: float = 0.2
-    entropy: float = 1e-3
+    entropy: float = 0.0
     width: int = 64
     workers: int = 1
     ray: int = 0
@@ -60,19 +57,15 @@ class Ppo:
         return self.env.num_envs * self.horizon * max(self.workers, self.ray)
 
 
-class Trainer:
-    """Trains into a folder: checkpoint, curve and picture, written after every batch as a whole or not at all.
+class PpoTrainer:
+    """Trains into a folder, see `Folder`.
 
-    A folder that holds a checkpoint is gone on with where `resume` is set, and refused otherwise. What was learnt, the optimiser, the
-    statistics and the curve go on where they were; episodes under way begin anew."""
+    A folder that holds a checkpoint is gone on with where `resume` is set, and refused otherwise. What was learnt, the optimiser,
+    the statistics and the curve go on where they were; episodes under way begin anew."""
 
-    def __init__(self, settings: Ppo, folder: Path, resume: bool = False) -> None:
-        self.folder, self.settings = folder, settings
-        saved = folder / CHECKPOINT
-        if saved.exists() and not resume:
-            raise InputError(f"'{folder}' holds a training already: resume it, or choose another folder")
-        folder.mkdir(parents=True, exist_ok=True)
+    def __init__(self, settings: Ppo, path: Path, resume: bool = False) -> None:
         torch.manual_seed(settings.env.seed)
+        self.folder, self.settings = Folder(path, "PPO", resume), settings
         probe = settings.env.make(num_envs=1)
         width = probe.observation_spec["observation"].shape[-1]
         self.actor = make_actor(width, probe.action_spec, settings.width)
@@ -82,26 +75,18 @@ class Trainer:
             self.actor, self.critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy, normalize_advantage=True
         )
         self.optimiser = torch.optim.Adam(self.loss.parameters(), settings.learning_rate, eps=1e-5)
-        self.rows: list[curve.Row] = []
-        self.seconds = 0.0
         self.shared = statistics(settings.env)
-        if saved.exists():
-            self._restore(load_checkpoint(saved))
+        if self.folder.saved is not None:
+            self._restore(self.folder.saved)
 
     def _restore(self, saved: dict[str, Any]) -> None:
         self.actor.load_state_dict(saved["actor"])
         self.critic.load_state_dict(saved["critic"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.shared.update_(saved["statistics"])
-        self.rows = [curve.Row(**row) for row in saved["rows"]]
-        self.seconds = saved["seconds"]
-        torch.set_rng_state(saved["random"])
-        self.settings = replace(self.settings, env=replace(self.settings.env, seed=self.settings.env.seed + len(self.rows)))
-
-    @property
-    def frames(self) -> int:
-        """Environment steps so far."""
-        return self.rows[-1].frames if self.rows else 0
+        # other starts than those that have been
+        fresh = replace(self.settings.env, seed=self.settings.env.seed + len(self.folder.rows))
+        self.settings = replace(self.settings, env=fresh)
 
     def _collector(self) -> Any:
         s = self.settings
@@ -116,24 +101,25 @@ class Trainer:
         return Collector(makers[0](), self.actor, **common)
 
     def run(self, frames: int, minutes: float = math.inf, progress: Callable[[curve.Row], object] | None = None) -> list[curve.Row]:
-        """Trains until so many environment steps, or minutes in all, are reached. Interrupted, it keeps what the last batch left."""
+        """Trains until so many environment steps, or minutes in all, are reached. Interrupted, it keeps what the last batch
+        left."""
         collector = self._collector()
-        started = time.perf_counter() - self.seconds
+        started = time.perf_counter() - self.folder.seconds
         try:
             for batch in collector:
                 loss = self._learn(batch)
-                self.seconds = time.perf_counter() - started
-                self.rows.append(_row(batch, self.frames, self.seconds, loss))
-                self.save()
+                self.folder.seconds = time.perf_counter() - started
+                self.folder.rows.append(_row(batch, self.folder.frames, self.folder.seconds, loss))
+                self._save()
                 if self.settings.workers > 1 or self.settings.ray:
                     collector.update_policy_weights_()
                 if progress is not None:
-                    progress(self.rows[-1])
-                if self.frames >= frames or self.seconds >= 60 * minutes:
+                    progress(self.folder.rows[-1])
+                if self.folder.frames >= frames or self.folder.seconds >= 60 * minutes:
                     break
         finally:
             collector.shutdown()
-        return self.rows
+        return self.folder.rows
 
     def _learn(self, batch: TensorDictBase) -> float:
         """Some epochs over a batch `[worlds, steps]`; the last loss."""
@@ -154,41 +140,10 @@ class Trainer:
                 last = float(total.detach())
         return last
 
-    def save(self) -> None:
-        """Checkpoint, curve and picture."""
-        part = self.folder / f"{CHECKPOINT}.part"
-        torch.save(
-            {
-                "format": FORMAT,
-                "settings": asdict(self.settings),
-                "actor": self.actor.state_dict(),
-                "critic": self.critic.state_dict(),
-                "optimiser": self.optimiser.state_dict(),
-                "statistics": {name: {k: v.clone() for k, v in self.shared[name].items()} for name in ("loc", "var", "count")},
-                "rows": [asdict(row) for row in self.rows],
-                "seconds": self.seconds,
-                "random": torch.get_rng_state(),
-            },
-            part,
-        )
-        os.replace(part, self.folder / CHECKPOINT)
-        curve.save(self.rows, self.folder / CURVE)
-        curve.draw({"PPO": self.rows}, self.folder / PICTURE, self.settings.env.name)
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents, without unpickling anything but plain data; raises `InputError` for what is none."""
-    try:
-        saved = torch.load(path, weights_only=True)
-        if saved.get("format") != FORMAT:
-            raise InputError(f"'{path}' has format {saved.get('format')!r}: must be {FORMAT!r}")
-    except FileNotFoundError:
-        raise InputError(f"no checkpoint at '{path}'") from None
-    except InputError:
-        raise
-    except Exception as error:  # pickle, zipfile and torch raise whatever they like on damaged files
-        raise InputError(f"'{path}' is not a readable checkpoint: {error}") from error
-    return dict(saved)
+    def _save(self) -> None:
+        parts = {"actor": self.actor, "critic": self.critic, "optimiser": self.optimiser}
+        states = {name: part.state_dict() for name, part in parts.items()}
+        self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
 
 
 def _row(batch: TensorDictBase, frames: int, seconds: float, loss: float) -> curve.Row:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import VecNormV2
 
@@ -14,6 +16,7 @@ from pbfd_torch.envs import make_env
 from pbfd_torch.learning.networks import SEEN
 
 _DECAY = 0.99995  # of the running mean and variance, per step of all worlds
+_LEAST = 1e-4  # scale
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,28 @@ class EnvSettings:
 
 def normaliser(shared: TensorDictBase | None = None) -> VecNormV2:
     """Running mean and variance of what is observed, its own or shared ones."""
-    return VecNormV2(["observation"], [SEEN], decay=_DECAY, reduce_batch_dims=True, shared_data=shared)
+    return VecNormV2(["observation"], [SEEN], decay=_DECAY, eps=_LEAST, reduce_batch_dims=True, shared_data=shared)
+
+
+def location_and_scale(statistics: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    """What the normaliser subtracts and divides by, `[nobs]` each, from its running sums, which start at zero."""
+    loc, var, count = (statistics[name]["observation"] for name in ("loc", "var", "count"))
+    weight = 1 - _DECAY ** count.double()
+    scale = ((var - loc.square()) / weight).sqrt().clamp_min(_LEAST)
+    return (loc / weight).float(), scale.float()
+
+
+def seen_more(statistics: TensorDictBase, observation: Tensor) -> None:
+    """Lets the running statistics see `[worlds, nobs]` once more, as the normaliser does at every step."""
+    weight = 1 - _DECAY
+    statistics["loc"]["observation"].lerp_(observation.mean(0), weight)
+    statistics["var"]["observation"].lerp_(observation.square().mean(0), weight)
+    statistics["count"]["observation"].add_(1)
+
+
+def plain(statistics: TensorDictBase) -> dict[str, dict[str, Tensor]]:
+    """The statistics as a checkpoint holds them."""
+    return {name: {k: v.clone() for k, v in statistics[name].items()} for name in ("loc", "var", "count")}
 
 
 def training_env(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import models
-from pbfd_torch.conventional import NewtonEuler
+from pbfd_torch.conventional.newton_euler import NewtonEuler
 from pbfd_torch.envs import PbfdEnv
 from pbfd_torch.errors import InputError
 
@@ -85,7 +85,7 @@ class ConventionalWorlds:
 
 
 class MujocoWorlds:
-    """MuJoCo, with Gymnasium's own file and 2 ms steps of RK4 for hopper and walker, and with our file, implicitfast, for others."""
+    """MuJoCo: Gymnasium's own file and its 2 ms steps of RK4 for hopper and walker, our file and implicitfast for others."""
 
     def __init__(self, name: str, env: PbfdEnv) -> None:
         import mujoco

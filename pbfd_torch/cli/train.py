@@ -1,0 +1,68 @@
+"""`pbfd train`: a controller by PPO, or by the simulator's gradients."""
+
+from __future__ import annotations
+
+import enum
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from tqdm import tqdm
+
+from pbfd_torch.cli.options import Dtype, use_threads
+
+
+class Method(enum.StrEnum):
+    PPO = "ppo"
+    SHAC = "shac"
+
+
+def train(
+    env: Annotated[str, typer.Argument(help="hopper, walker, hopper-3d, walker-3d, cart-pole, reacher or push-box.")],
+    out: Annotated[Path, typer.Option(help="Folder for checkpoint, curve and picture.")],
+    method: Annotated[Method, typer.Option(help="PPO, or a short-horizon actor–critic on the simulator's gradients.")] = Method.PPO,
+    frames: Annotated[int, typer.Option(help="Environment steps in all.")] = 2_000_000,
+    minutes: Annotated[float | None, typer.Option(help="Of training in all, whichever comes first.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder holds.")] = False,
+    seed: Annotated[int, typer.Option(help="Of networks, starts and exploration.")] = 0,
+    envs: Annotated[int | None, typer.Option(help="Worlds of each process; default: 256 for PPO, 64 for SHAC.")] = None,
+    workers: Annotated[int, typer.Option(help="PPO: processes that collect.")] = 1,
+    ray: Annotated[int, typer.Option(help="PPO: Ray collectors instead, on one machine or a cluster (extra 'ray').")] = 0,
+    dtype: Annotated[Dtype, typer.Option(help="Of the simulation.")] = Dtype.FLOAT64,
+    control_dt: Annotated[float | None, typer.Option(help="Seconds between actions; default: the task's.")] = None,
+    dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: one per action.")] = None,
+    threads: Annotated[int, typer.Option(help="PyTorch's threads inside an operation.")] = 1,
+) -> None:
+    """Trains a controller. Interrupted at any time, it keeps what the last batch left; --resume goes on from there."""
+    from pbfd_torch.learning.training_env import EnvSettings
+
+    use_threads(threads)
+    worlds = envs or (256 if method is Method.PPO else 64)
+    where = EnvSettings(env, worlds, seed, dtype.value, control_dt, dt)
+    trainer: Any
+    if method is Method.PPO:
+        from pbfd_torch.learning.ppo import Ppo, PpoTrainer
+
+        trainer = PpoTrainer(Ppo(where, workers=workers, ray=ray), out, resume)
+    else:
+        from pbfd_torch.learning.shac import Shac, ShacTrainer
+
+        trainer = ShacTrainer(Shac(where), out, resume)
+    with tqdm(total=frames, unit="step", initial=trainer.folder.frames, disable=not sys.stderr.isatty(), leave=False) as bar:
+
+        def progress(row: Any) -> None:
+            bar.set_postfix_str(f"return {row.mean_return:.0f}, {row.episodes} episodes")
+            bar.update(row.frames - bar.n)
+
+        try:
+            rows = trainer.run(frames, float("inf") if minutes is None else minutes, progress)
+        except KeyboardInterrupt:
+            rows = trainer.folder.rows
+    last = rows[-1] if rows else None
+    said = (
+        "nothing learnt yet"
+        if last is None
+        else f"mean return {last.mean_return:.1f} after {last.frames} steps, {last.seconds / 60:.1f} min"
+    )
+    print(f"{said}; written to {out}")

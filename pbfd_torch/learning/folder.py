@@ -1,0 +1,79 @@
+"""The folder of a training: checkpoint, curve and picture, each written whole, and gone on with after an interruption."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.learning import curve
+
+FORMAT = "pbfd_torch policy 1"
+CHECKPOINT, CURVE, PICTURE = "checkpoint.pt", "curve.csv", "curve.png"
+
+
+class Folder:
+    """Holds the curve so far, and what was `saved` where a training is gone on with.
+
+    Raises `InputError` where the folder holds a training and `resume` is not set, and for a checkpoint of another method."""
+
+    def __init__(self, path: Path, method: str, resume: bool) -> None:
+        self.path, self.method = path, method
+        self.rows: list[curve.Row] = []
+        self.seconds = 0.0
+        self.saved: dict[str, Any] | None = None
+        checkpoint = path / CHECKPOINT
+        if checkpoint.exists():
+            if not resume:
+                raise InputError(f"'{path}' holds a training already: resume it, or choose another folder")
+            self.saved = load_checkpoint(checkpoint)
+            if self.saved["method"] != method:
+                raise InputError(f"'{path}' holds a training by {self.saved['method']}: go on with that, or choose another folder")
+            self.rows = [curve.Row(**row) for row in self.saved["rows"]]
+            self.seconds = self.saved["seconds"]
+            torch.set_rng_state(self.saved["random"])
+        path.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def frames(self) -> int:
+        """Environment steps so far."""
+        return self.rows[-1].frames if self.rows else 0
+
+    def write(self, settings: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
+        """Everything there is to go on with. `settings` holds those of the environment under "env", and the networks' "width"."""
+        part = self.path / f"{CHECKPOINT}.part"
+        torch.save(
+            {
+                "format": FORMAT,
+                "method": self.method,
+                "settings": dict(settings),
+                "rows": [asdict(row) for row in self.rows],
+                "seconds": self.seconds,
+                "random": torch.get_rng_state(),
+                **parts,
+            },
+            part,
+        )
+        os.replace(part, self.path / CHECKPOINT)
+        curve.save(self.rows, self.path / CURVE)
+        curve.draw({self.method: self.rows}, self.path / PICTURE, settings["env"]["name"])
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint's contents, without unpickling anything but plain data; raises `InputError` for what is none."""
+    try:
+        saved = torch.load(path, weights_only=True)
+        if saved.get("format") != FORMAT:
+            raise InputError(f"'{path}' has format {saved.get('format')!r}: must be {FORMAT!r}")
+    except FileNotFoundError:
+        raise InputError(f"no checkpoint at '{path}'") from None
+    except InputError:
+        raise
+    except Exception as error:  # pickle, zipfile and torch raise whatever they like on damaged files
+        raise InputError(f"'{path}' is not a readable checkpoint: {error}") from error
+    return dict(saved)

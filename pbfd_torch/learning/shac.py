@@ -1,0 +1,207 @@
+"""A short-horizon actor–critic that follows the simulator's gradients, after Xu et al. (2022).
+
+The actor climbs the return of a few steps plus the critic's value of where they lead, differentiated through the simulation; the
+critic learns returns over the same steps, TD(λ), as seen by a slowly following copy of itself.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from pbfd_torch.envs.packing import unpacked
+from pbfd_torch.errors import InputError
+from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.integrators.integrator import State
+from pbfd_torch.learning import curve
+from pbfd_torch.learning.folder import Folder
+from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
+from pbfd_torch.learning.training_env import EnvSettings, location_and_scale, plain, seen_more, statistics
+from pbfd_torch.solvers.per_world import chosen, mapped
+
+
+@dataclass(frozen=True)
+class Shac:
+    """Attributes:
+    env: where.
+    horizon: steps that gradients go through.
+    actor_rate, critic_rate: learning rates, falling to a tenth over `decay` environment steps.
+    epochs: of the critic over each batch. gamma, lmbda, width: the usual ones.
+    following: how much of the critic's copy stays in each update. largest: norm that gradients of the actor are cut to.
+    """
+
+    env: EnvSettings
+    horizon: int = 16
+    actor_rate: float = 2e-3
+    critic_rate: float = 2e-3
+    decay: int = 1_000_000
+    epochs: int = 8
+    gamma: float = 0.99
+    lmbda: float = 0.95
+    width: int = 64
+    following: float = 0.4
+    largest: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "epochs", "width", "decay"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+
+
+@dataclass(frozen=True, eq=False)
+class _Leg:
+    """What the critic learns from, `[horizon, worlds, …]`: what was seen before and after each step, reward, and how it ended."""
+
+    seen: Tensor
+    after: Tensor
+    reward: Tensor
+    terminated: Tensor
+    ended: Tensor
+
+
+class ShacTrainer:
+    """Trains into a folder, as `PpoTrainer` does."""
+
+    def __init__(self, settings: Shac, path: Path, resume: bool = False) -> None:
+        torch.manual_seed(settings.env.seed)
+        self.folder, self.settings = Folder(path, "SHAC", resume), settings
+        self.env: Any = settings.env.make(seed=settings.env.seed + len(self.folder.rows))
+        # a step without a derivative ends those of its world, and no other's
+        self.env.simulator.gradients = Gradients(Doubtful.ZERO)
+        width = self.env.observation_spec["observation"].shape[-1]
+        self.actor = make_actor(width, self.env.action_spec, settings.width)
+        self.critic = make_critic(width, settings.width)
+        self.target = copy.deepcopy(self.critic)
+        self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, betas=(0.7, 0.95))
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, betas=(0.7, 0.95))
+        self.shared = statistics(settings.env)
+        self._parts = {"actor": self.actor, "critic": self.critic, "target": self.target}
+        self._parts |= {"actor_optimiser": self.actor_optimiser, "critic_optimiser": self.critic_optimiser}
+        if self.folder.saved is not None:
+            for name, part in self._parts.items():
+                part.load_state_dict(self.folder.saved[name])
+            self.shared.update_(self.folder.saved["statistics"])
+        worlds = settings.env.num_envs
+        self._state, self._steps = self._fresh(worlds)
+        self._return = torch.zeros(worlds)
+
+    def _fresh(self, worlds: int) -> tuple[State, Tensor]:
+        flat = self.env._taken(worlds)
+        return unpacked(flat, self.env._like), flat["steps"].squeeze(-1)
+
+    def run(self, frames: int, minutes: float = math.inf, progress: Callable[[curve.Row], object] | None = None) -> list[curve.Row]:
+        """See `PpoTrainer.run`."""
+        started = time.perf_counter() - self.folder.seconds
+        while self.folder.frames < frames and self.folder.seconds < 60 * minutes:
+            fall = max(0.1, 1 - 0.9 * self.folder.frames / self.settings.decay)
+            for optimiser, rate in (
+                (self.actor_optimiser, self.settings.actor_rate),
+                (self.critic_optimiser, self.settings.critic_rate),
+            ):
+                optimiser.param_groups[0]["lr"] = fall * rate
+            leg, row = self._act()
+            loss = self._judge(leg)
+            self.folder.seconds = time.perf_counter() - started
+            self.folder.rows.append(curve.Row(seconds=self.folder.seconds, loss=loss, **row))
+            states = {name: part.state_dict() for name, part in self._parts.items()}
+            self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
+            if progress is not None:
+                progress(self.folder.rows[-1])
+        return self.folder.rows
+
+    def _value(self, critic: Any, seen: Tensor) -> Tensor:
+        return critic(TensorDict({SEEN: seen}, seen.shape[:-1]))["state_value"].squeeze(-1)
+
+    def _act(self) -> tuple[_Leg, dict[str, Any]]:
+        """Some steps, and one of the actor along their gradient."""
+        s, env = self.settings, self.env
+        loc, scale = location_and_scale(plain(self.shared))
+        state = mapped(lambda x: x.detach(), self._state)
+        worlds = s.env.num_envs
+        gain, discount = torch.zeros(worlds), torch.ones(worlds)
+        parts: list[tuple[Tensor, ...]] = []
+        returns, lengths, unsolved = [], [], 0
+        observation = env.observe(state.q, env._velocity(env.simulator, state))
+        for k in range(s.horizon):
+            seen_more(self.shared, observation.detach().float())
+            seen = (observation.float() - loc) / scale
+            action = self.actor.get_dist(TensorDict({SEEN: seen}, [worlds])).rsample()
+            outcome = env.advanced(state, action)
+            self._steps = self._steps + 1
+            truncated = (self._steps >= env.max_episode_steps) & ~outcome.terminated
+            ended = outcome.terminated | truncated
+            after = (outcome.observation.float() - loc) / scale
+            reward = outcome.reward.float()
+            gain = gain + discount * reward
+            last = torch.full_like(ended, k == s.horizon - 1)
+            ahead = torch.where(outcome.terminated, 0.0, self._value(self.target, after))
+            gain = gain + torch.where(ended | last, discount * s.gamma * ahead, 0.0)
+            discount = torch.where(ended, 1.0, discount * s.gamma)
+            parts.append((seen.detach(), after.detach(), reward.detach(), outcome.terminated, ended))
+            self._return += reward.detach()
+            unsolved += int(outcome.unsolved.sum())
+            returns.append(self._return[ended].clone())
+            lengths.append(self._steps[ended].float())
+            state, observation = outcome.state, outcome.observation
+            if bool(ended.any()):
+                fresh, steps = self._fresh(worlds)
+                state = chosen(ended, fresh, state)
+                begun = env.observe(fresh.q, env._velocity(env.simulator, fresh))
+                observation = torch.where(ended[:, None], begun, observation)
+                self._steps = torch.where(ended, steps, self._steps)
+                self._return = torch.where(ended, 0.0, self._return)
+        self._state = mapped(lambda x: x.detach(), state)
+        self.actor_optimiser.zero_grad()
+        (-gain.mean() / s.horizon).backward()
+        for parameter in self.actor.parameters():  # a step at the edge of being singular must not undo what was learnt
+            if parameter.grad is not None:
+                parameter.grad.nan_to_num_(0.0, 0.0, 0.0)
+        torch.nn.utils.clip_grad_norm_(self.actor.parameters(), s.largest)
+        self.actor_optimiser.step()
+        leg = _Leg(*(torch.stack(x) for x in zip(*parts, strict=True)))
+        finished, long = torch.cat(returns), torch.cat(lengths)
+        some = len(finished) > 0
+        return leg, {
+            "frames": self.folder.frames + worlds * s.horizon,
+            "episodes": len(finished),
+            "mean_return": float(finished.mean()) if some else math.nan,
+            "lowest_return": float(finished.min()) if some else math.nan,
+            "highest_return": float(finished.max()) if some else math.nan,
+            "mean_length": float(long.mean()) if some else math.nan,
+            "reward": float(leg.reward.mean()),
+            "unsolved": unsolved / (worlds * s.horizon),
+        }
+
+    def _judge(self, leg: _Leg) -> float:
+        """The critic learns TD(λ) returns; its copy follows. The last loss."""
+        s = self.settings
+        with torch.no_grad():
+            ahead = torch.where(leg.terminated, 0.0, self._value(self.target, leg.after))
+            goals = [ahead[-1]]
+            for k in reversed(range(s.horizon)):
+                carried = torch.where(leg.ended[k], ahead[k], (1 - s.lmbda) * ahead[k] + s.lmbda * goals[-1])
+                goals.append(leg.reward[k] + s.gamma * carried)
+            goal = torch.stack(goals[:0:-1]).flatten()
+        seen = leg.seen.flatten(0, 1)
+        last = math.nan
+        for _ in range(s.epochs):
+            for part in torch.randperm(len(goal)).chunk(4):
+                loss = torch.nn.functional.smooth_l1_loss(self._value(self.critic, seen[part]), goal[part])
+                self.critic_optimiser.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self.critic.parameters(), s.largest)
+                self.critic_optimiser.step()
+                last = float(loss.detach())
+        with torch.no_grad():
+            for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
+                slow.lerp_(fast, 1 - s.following)
+        return last
