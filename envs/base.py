@@ -25,7 +25,7 @@ from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.terms.actuators import Actuators
 
 DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
-POOL = 256  # starts that are made at once, at least: each costs a solve
+POOL = 256  # starts that are made at once, at most 16 for each world, unless more are needed: a solve each
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +124,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         start = self._fresh(1)
         self._like: State = self._state_like
         self._make_specs(start)
+        self._set_seed(self._seed)  # the probe has drawn numbers
 
     # what a task says ------------------------------------------------------------------------------------------------
 
@@ -295,7 +296,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         """As many starts, out of a pool that is filled when it is empty: a solve for many costs little more than one for a few."""
         have = len(next(iter(self._pool.values()))) if self._pool else 0
         if have < worlds:
-            made = self._fresh(max(POOL, worlds) if math.prod(self.batch_size) > 1 else 16)
+            made = self._fresh(max(worlds, min(POOL, 16 * math.prod(self.batch_size))))
             self._pool = {name: torch.cat((self._pool[name], x)) for name, x in made.items()} if self._pool else made
         first = {name: value[:worlds] for name, value in self._pool.items()}
         self._pool = {name: value[worlds:] for name, value in self._pool.items()}
