@@ -186,10 +186,10 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self._pool: dict[str, Tensor] = {}
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any) -> TensorDictBase:
-        if set_state and tensordict is not None and "state" in tensordict:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if set_state and mask is None and tensordict is not None and "state" in tensordict:
             state = dict(tensordict["state"].items())
             return self._seen(unpacked(state, self._like), state)
-        mask = None if tensordict is None else tensordict.get("_reset", None)
         where = torch.ones(self.batch_size, dtype=torch.bool, device=self.device) if mask is None else mask.reshape(self.batch_size)
         index = where.nonzero().squeeze(-1)
         fresh = self._taken(len(index))
