@@ -149,7 +149,7 @@ def test_set_state_puts_worlds_there() -> None:
 
 
 def test_a_free_fall_is_a_free_fall() -> None:
-    """A hopper one metre up falls by ½ g t² exactly, the start being of second order, and its reward is that of not moving forward."""
+    """A hopper one metre up falls by ½ g t² exactly, the start being of second order, and is not rewarded for moving."""
     env = HopperEnv(num_envs=1)
     q, steps = bent(env), 25
     seen = played(env, actions(env, steps, size=0.0), env.set_state(q, torch.zeros_like(q)))

@@ -169,7 +169,7 @@ def test_what_a_policy_sees_is_what_it_saw(tmp_path: Path) -> None:
 
 
 def test_policies_on_trial_elsewhere(trained: Path, tmp_path: Path) -> None:
-    """A trained policy keeps most of its return on Newton–Euler and MuJoCo; each trial's rollout can be saved, loaded and overlaid."""
+    """A trained policy keeps most of its return on Newton–Euler and MuJoCo; each trial's rollout can be saved and loaded."""
     policy = Policy.load(trained / "checkpoint.pt")
     trials = [tried(policy, policy.settings, on, episodes=8) for on in SIMULATORS]
     for trial in trials:

@@ -65,8 +65,8 @@ def plain(statistics: TensorDictBase) -> dict[str, dict[str, Tensor]]:
 
 
 def training_env(settings: EnvSettings, worker: int = 0, shared: Path | None = None, frozen: bool = False) -> TransformedEnv:
-    """The environment of one worker; its seed follows from the settings' and the worker's number. shared: folder of the `statistics`
-    that all workers see and add to; frozen: that they only see."""
+    """The environment of one worker; its seed follows from the settings' and the worker's number. shared: folder of the
+    `statistics` that all workers see and add to; frozen: that they only see."""
     norm = normaliser(None if shared is None else TensorDict.load_memmap(shared))
     if frozen:
         norm.freeze()
