@@ -25,6 +25,7 @@ from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.terms.actuators import Actuators
 
 DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
+KEPT = ("start_v", *DRAWN)  # of an episode, from its start
 POOL = 256  # starts that are made at once, at most 16 for each world, unless more are needed: a solve each
 
 
@@ -200,9 +201,11 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
 
     def _seen(self, state: State, flat: Mapping[str, Tensor]) -> TensorDictBase:
         none = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        # at a start an integrator's own velocity may be that of the step before it
+        v = torch.where(flat["steps"] == 0, flat["start_v"], self._velocity(self.simulator, state))
         return TensorDict(
             {
-                "observation": self.observe(state.q, self._velocity(self.simulator, state)).float(),
+                "observation": self.observe(state.q, v).float(),
                 "unsolved": none,
                 "done": none.clone(),
                 "terminated": none.clone(),
@@ -222,7 +225,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             outcome = self.advanced(unpacked(flat, self._like), action, flat)
         steps = flat["steps"] + 1
         truncated = (steps >= self.max_episode_steps) & ~outcome.terminated[:, None]
-        state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in DRAWN if name in flat}
+        state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in KEPT if name in flat}
         if self.randomization is not None:
             state["world_push"] = self.randomization.pushed(flat["world_push"], self._random)
         return TensorDict(
@@ -282,7 +285,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
     def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
         """Packed states at q with v, at the first step of an episode."""
         worlds = len(q)
-        flat = {"steps": torch.zeros((worlds, 1), dtype=torch.int64, device=q.device)}
+        flat = {"steps": torch.zeros((worlds, 1), dtype=torch.int64, device=q.device), "start_v": v.clone()}
         drawn = None if self.randomization is None else self.randomization.drawn(worlds, self._random)
         with torch.no_grad():
             state = self._of(drawn).initial_state(q, v)

@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 
+from pbfd_torch import view
 from pbfd_torch.learning.evaluation import Policy, tried
 from pbfd_torch.learning.ppo import Ppo, PpoTrainer
 from pbfd_torch.learning.training_env import EnvSettings
@@ -47,7 +48,13 @@ right.legend()
 plt.show()
 
 # %% [markdown]
-# Each trial's rollout is a record like any other: `trial.rollout.save("pole.npz")`, then `pbfd view pole.npz`.
+# Each trial's rollout is a record like any other, and can be looked at, here MuJoCo's as a ghost over ours. A notebook shows the
+# viewer in place when `shown` is the last line of a cell; it is closed at once here.
+
+# %%
+shown = view(trials["pbfd"].rollout, ghost=trials["mujoco"].rollout)
+assert shown.address.startswith("http://localhost:")
+shown.close()
 
 # %%
 assert trials["pbfd"].mean > 3 * rows[0].mean_return

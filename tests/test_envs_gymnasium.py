@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -76,11 +77,12 @@ def test_observation_action_and_time_step_of_hopper_and_walker_are_gymnasiums() 
     """Against Gymnasium's own v5 environments: spaces, control step, first observation and its noise."""
     pytest.importorskip("mujoco")
     for ours, theirs in (("Hopper-v0", "Hopper-v5"), ("Walker-v0", "Walker2d-v5")):
-        mine, peer = gymnasium.make(f"{PREFIX}/{ours}").unwrapped, gymnasium.make(theirs).unwrapped
+        mine: Any = gymnasium.make(f"{PREFIX}/{ours}").unwrapped
+        peer: Any = gymnasium.make(theirs).unwrapped
         assert mine.observation_space.shape == peer.observation_space.shape
         np.testing.assert_array_equal(mine.action_space.low, peer.action_space.low)
         np.testing.assert_array_equal(mine.action_space.high, peer.action_space.high)
-        assert make_env(IDS[ours]).control_dt == pytest.approx(peer.dt)  # type: ignore[attr-defined]
+        assert make_env(IDS[ours]).control_dt == pytest.approx(peer.dt)
         first, other = mine.reset(seed=0)[0], peer.reset(seed=0)[0]
         np.testing.assert_allclose(first, other, atol=1e-2 + 1e-6)
         centre = np.zeros_like(first)

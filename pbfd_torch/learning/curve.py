@@ -81,6 +81,7 @@ def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
     axes[1].set(xlabel="minutes of training")
     for axis in axes:
         axis.grid(alpha=0.3)
-    axes[0].legend(loc="upper left")
+    if axes[0].get_legend_handles_labels()[0]:
+        axes[0].legend(loc="upper left")
     figure.savefig(path)
     plt.close(figure)
