@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import viser
 
 from pbfd_torch.rollout import Rollout
@@ -11,20 +9,21 @@ from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.film import Film
 from pbfd_torch.viewer.layout import MOST
 from pbfd_torch.viewer.plots import Plot
+from pbfd_torch.viewer.served import Served
 from pbfd_torch.viewer.stage import Stage
 from pbfd_torch.viewer.timeline import Timeline
 
 
-class Inspector:
+class Inspector(Served):
     """Shows a rollout, and a `ghost` over it, at an `address` for browsers, until `close`.
 
     host, port: where; by default only this computer can see it, and the next free port is taken where the wanted one is not free.
     Raises `InputError` for a host or port that cannot be used, and for a ghost with other links."""
 
     def __init__(self, rollout: Rollout, ghost: Rollout | None = None, host: str = serving.HOST, port: int = serving.PORT) -> None:
+        super().__init__()
         self.film, self._ghost = Film(rollout), None if ghost is None else Film(ghost)
         self.server = serving.start(host, port)
-        self._closed = threading.Event()
         try:
             self.stage = Stage(self.server, self.film, self._ghost)
             self._build(self.server.gui)
@@ -34,23 +33,9 @@ class Inspector:
             self.close()
             raise
 
-    @property
-    def address(self) -> str:
-        """What to open in a browser."""
-        return serving.address(self.server)
-
-    def wait(self) -> None:
-        """Returns once it is closed, or with KeyboardInterrupt."""
-        while not self._closed.wait(0.2):
-            pass
-
-    def close(self) -> None:
-        """Stops the server; browsers lose their connection."""
-        if not self._closed.is_set():
-            self._closed.set()
-            if hasattr(self, "timeline"):
-                self.timeline.pause()
-            serving.stop(self.server)
+    def _ended(self) -> None:
+        if hasattr(self, "timeline"):
+            self.timeline.pause()
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.address}" width="100%" height="560" style="border:1px solid #ccc"></iframe>'

@@ -27,6 +27,7 @@ from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.film import Film
+from pbfd_torch.viewer.served import Served
 from pbfd_torch.viewer.stage import Stage
 
 STEPS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)  # [s] to choose from
@@ -35,7 +36,7 @@ _WIDEST = math.pi  # [rad or m] of a joint's slider without limits
 _SERVO = 20.0  # [rad/s] how fast a joint follows its slider, critically damped
 
 
-class Live:
+class Live(Served):
     """Steps world 0 of a setup in real time at an `address`, until `close`.
 
     dt: step [s], None: the scene's; integrator: one of `INTEGRATORS`. Sliders: control of the scene's actuators, or joint targets
@@ -52,6 +53,7 @@ class Live:
     ) -> None:
         if integrator not in INTEGRATORS:
             raise InputError(f"integrator is '{integrator}': must be one of {', '.join(INTEGRATORS)}")
+        super().__init__()
         scene = setup.scene
         self._start = setup.q[:1], setup.v[:1]
         self._targets = not scene.nu
@@ -61,7 +63,7 @@ class Live:
         self._mu: float | None = None
         self._control = _first_control(setup, self._scene)
         self._lock = threading.RLock()
-        self._closed, self._paused = threading.Event(), False
+        self._paused = False
         self.steps, self.time = 0, 0.0
         self._rebuild(*self._start)
         self.film = Film(self._record(*self._advanced()))
@@ -80,27 +82,13 @@ class Live:
         self._clock.start()
 
     @property
-    def address(self) -> str:
-        """What to open in a browser."""
-        return serving.address(self.server)
-
-    @property
     def q(self) -> Tensor:
         """The configuration now `[nq]`."""
         return self._state.q[0]
 
-    def wait(self) -> None:
-        """Returns once it is closed, or with KeyboardInterrupt."""
-        while not self._closed.wait(0.2):
-            pass
-
-    def close(self) -> None:
-        """Stops stepping and serving."""
-        if not self._closed.is_set():
-            self._closed.set()
-            if hasattr(self, "_clock"):
-                self._clock.join(60.0)  # a step that is being solved must not outlive the interpreter
-            serving.stop(self.server)
+    def _ended(self) -> None:
+        if hasattr(self, "_clock"):
+            self._clock.join(60.0)  # a step that is being solved must not outlive the interpreter
 
     # stepping -------------------------------------------------------------------------------------------------------------
 
