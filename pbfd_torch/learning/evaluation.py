@@ -132,6 +132,6 @@ def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:
     axis.set_xticks(range(len(trials)), list(trials))
     axis.set(ylabel="return, mean and standard deviation over episodes")
     axis.grid(axis="y", alpha=0.3)
-    axis.legend(title="evaluated on")
+    axis.legend(title="evaluated on", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(path)
     plt.close(figure)
