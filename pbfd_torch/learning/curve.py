@@ -9,11 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,8 @@ def _row(row: Mapping[str, str]) -> Row:
 
 def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
     """Mean return over environment steps and over time, each curve with the range of its episodes."""
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.2), dpi=130, layout="constrained", sharey=True)
+    figure = Figure(figsize=(11, 4.2), dpi=130, layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
     for k, (name, rows) in enumerate(curves.items()):
         ended = [row for row in rows if row.episodes]
         if not ended:
@@ -84,4 +82,3 @@ def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="upper left")
     figure.savefig(path)
-    plt.close(figure)

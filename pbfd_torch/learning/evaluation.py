@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from pbfd_torch.envs import PbfdEnv, Step
@@ -120,7 +117,8 @@ def tried(
 
 def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:
     """Bars of mean return for each policy and simulator, with the spread: the paper's Fig. 7."""
-    figure, axis = plt.subplots(figsize=(1.8 + 2.2 * len(trials), 4.2), dpi=130, layout="constrained")
+    figure = Figure(figsize=(1.8 + 2.2 * len(trials), 4.2), dpi=130, layout="constrained")
+    axis = figure.subplots()
     kinds = list(dict.fromkeys(trial.on for group in trials.values() for trial in group))
     width = 0.8 / len(kinds)
     for k, kind in enumerate(kinds):
@@ -134,4 +132,3 @@ def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:
     axis.grid(axis="y", alpha=0.3)
     axis.legend(title="evaluated on", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     figure.savefig(path)
-    plt.close(figure)
