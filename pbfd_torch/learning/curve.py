@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,19 @@ class Row:
     reward: float
     unsolved: float
     loss: float
+
+
+def of_episodes(returns: Tensor, lengths: Tensor) -> dict[str, Any]:
+    """A row's entries on the episodes `[n]` that ended."""
+    if not len(returns):
+        return {"episodes": 0} | dict.fromkeys(("mean_return", "lowest_return", "highest_return", "mean_length"), math.nan)
+    return {
+        "episodes": len(returns),
+        "mean_return": float(returns.mean()),
+        "lowest_return": float(returns.min()),
+        "highest_return": float(returns.max()),
+        "mean_length": float(lengths.mean()),
+    }
 
 
 def save(rows: Sequence[Row], path: Path) -> None:

@@ -16,11 +16,7 @@ def make_actor(observations: int, actions: Bounded, width: int = 64) -> Probabil
     """A Gaussian through tanh within the bounds of `actions`; its spread does not depend on what is seen."""
     low, high = (x.reshape(-1, x.shape[-1])[0] for x in (actions.space.low, actions.space.high))
     count = low.shape[-1]
-    body = MLP(observations, count, num_cells=[width, width], activation_class=nn.Tanh)
-    for layer in body:
-        if isinstance(layer, nn.Linear):
-            nn.init.orthogonal_(layer.weight, 1.4 if layer.out_features == width else 0.01)
-            nn.init.zeros_(layer.bias)
+    body = _body(observations, count, width, 0.01)
     head = AddStateIndependentNormalScale(count, scale_mapping="exp", init_value=_START_SCALE)
     module = TensorDictModule(nn.Sequential(body, head), in_keys=[SEEN], out_keys=["loc", "scale"])
     return ProbabilisticActor(
@@ -35,12 +31,17 @@ def make_actor(observations: int, actions: Bounded, width: int = 64) -> Probabil
 
 def make_critic(observations: int, width: int = 64) -> ValueOperator:
     """The value of what is seen."""
-    body = MLP(observations, 1, num_cells=[width, width], activation_class=nn.Tanh)
+    return ValueOperator(_body(observations, 1, width, 1.0), in_keys=[SEEN])
+
+
+def _body(inputs: int, outputs: int, width: int, last: float) -> MLP:
+    """Two hidden layers; orthogonal weights, of gain `last` in the last layer."""
+    body = MLP(inputs, outputs, num_cells=[width, width], activation_class=nn.Tanh)
     for layer in body:
         if isinstance(layer, nn.Linear):
-            nn.init.orthogonal_(layer.weight, 1.4 if layer.out_features == width else 1.0)
+            nn.init.orthogonal_(layer.weight, 1.4 if layer.out_features == width else last)
             nn.init.zeros_(layer.bias)
-    return ValueOperator(body, in_keys=[SEEN])
+    return body
 
 
 def mean_action(actor: ProbabilisticActor, seen: torch.Tensor) -> torch.Tensor:

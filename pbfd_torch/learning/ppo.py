@@ -155,16 +155,11 @@ def _row(batch: TensorDictBase, frames: int, seconds: float, loss: float) -> cur
     end = batch["next", "done"].squeeze(-1)
     returns = batch["next", "episode_reward"].squeeze(-1)[end]
     lengths = batch["next", "step_count"].squeeze(-1)[end].float()
-    some = len(returns) > 0
     return curve.Row(
         frames=frames + batch.numel(),
         seconds=seconds,
-        episodes=len(returns),
-        mean_return=float(returns.mean()) if some else math.nan,
-        lowest_return=float(returns.min()) if some else math.nan,
-        highest_return=float(returns.max()) if some else math.nan,
-        mean_length=float(lengths.mean()) if some else math.nan,
         reward=float(batch["next", "reward"].mean()),
         unsolved=float(batch["next", "unsolved"].float().mean()),
         loss=loss,
+        **curve.of_episodes(returns, lengths),
     )

@@ -170,17 +170,11 @@ class ShacTrainer:
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), s.largest)
         self.actor_optimiser.step()
         leg = _Leg(*(torch.stack(x) for x in zip(*parts, strict=True)))
-        finished, long = torch.cat(returns), torch.cat(lengths)
-        some = len(finished) > 0
         return leg, {
             "frames": self.folder.frames + worlds * s.horizon,
-            "episodes": len(finished),
-            "mean_return": float(finished.mean()) if some else math.nan,
-            "lowest_return": float(finished.min()) if some else math.nan,
-            "highest_return": float(finished.max()) if some else math.nan,
-            "mean_length": float(long.mean()) if some else math.nan,
             "reward": float(leg.reward.mean()),
             "unsolved": unsolved / (worlds * s.horizon),
+            **curve.of_episodes(torch.cat(returns), torch.cat(lengths)),
         }
 
     def _judge(self, leg: _Leg) -> float:
