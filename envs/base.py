@@ -81,6 +81,8 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         max_episode_steps: after which an episode is truncated; None: the task's.
         randomization: see `Randomization`.
 
+    Attributes: `low`, `high` `[nu]`: the range of actions, in the dtype of the simulation; `scene`, `simulator`: what is stepped.
+
     Actions out of range are clipped, and costs are those of the clipped action. An action with NaN counts as zero, and its world is
     terminated and marked "unsolved", as is one whose step has no solution; its last observation is the one before. Raises
     `InputError` for arguments out of range, and for actions of another shape."""
@@ -117,7 +119,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.scene = self.setup.scene
         self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler())
         (bank,) = (term for term in self.scene.terms if isinstance(term, Actuators))
-        self._low, self._high = bank.control_range.unbind(-1)
+        self.low, self.high = bank.control_range.unbind(-1)
         if not bool(torch.isfinite(bank.control_range).all()):
             raise InputError("actuators of an environment need control ranges")
         self._seed = 0 if seed is None else seed
@@ -172,7 +174,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             shape=shape,
         )
         self.state_spec = Composite(state=state.clone(), shape=shape)
-        low, high = (x.float().expand(*shape, -1).clone() for x in (self._low, self._high))
+        low, high = (x.float().expand(*shape, -1).clone() for x in (self.low, self.high))
         self.action_spec = Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device)
         flags = {name: Binary(1, (*shape, 1), dtype=torch.bool, device=device) for name in ("done", "terminated", "truncated")}
         self.done_spec = Composite(flags, shape=shape)
@@ -249,7 +251,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         worlds of a `randomization` have drawn, as in the tensordict's "state"."""
         simulator = self._of(drawn)
         bad = torch.isnan(action).any(-1)
-        control = torch.where(bad[:, None], 0.0, action).to(self.scene.articulation.dtype).clamp(self._low, self._high)
+        control = torch.where(bad[:, None], 0.0, action).to(self.scene.articulation.dtype).clamp(self.low, self.high)
         now, solved = state, ~bad
         for _ in range(self.substeps):
             now, solution = simulator.step(now, control)
@@ -262,6 +264,12 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         terminated = unsolved | ~self.healthy(now.q, v)
         reward = self.reward(Step(state.q, now.q, v, control, self.control_dt))
         return Outcome(now, self.observe(now.q, v), torch.where(unsolved, 0.0, reward), terminated, unsolved)
+
+    def starts(self, worlds: int) -> tuple[State, Tensor]:
+        """States at the first step of so many episodes, and what is seen of them, `[worlds, nobs]` in the simulation's dtype."""
+        flat = self._taken(worlds)
+        state = unpacked(flat, self._like)
+        return state, self.observe(state.q, flat["start_v"])
 
     def set_state(self, q: Tensor, v: Tensor) -> TensorDictBase:
         """The tensordict of worlds at q `[num_envs, nq]` with velocity v `[num_envs, nv]`, to step on from: the first of an

@@ -18,7 +18,6 @@ import torch
 
 from pbfd_torch import InputError, Rollout
 from pbfd_torch.envs import make_env
-from pbfd_torch.envs.packing import unpacked
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.evaluation import Policy, draw, tried
 from pbfd_torch.learning.folder import load_checkpoint
@@ -118,8 +117,7 @@ def test_two_ray_collectors(tmp_path: Path) -> None:
 def test_gradients_of_the_return_are_right(name: str) -> None:
     """The sum of rewards over five steps by the first action: within 1e-5 of central differences."""
     env = make_env(name, num_envs=2, seed=1)
-    flat = env._taken(2)
-    state = unpacked(flat, env._like)
+    state, _ = env.starts(2)
     width = env.action_spec.shape[-1]
     rest = 0.1 * torch.ones(2, width, dtype=torch.float64)
 

@@ -26,7 +26,7 @@ def train(
     minutes: Annotated[float | None, typer.Option(help="Of training in all, whichever comes first.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what the folder holds.")] = False,
     seed: Annotated[int, typer.Option(help="Of networks, starts and exploration.")] = 0,
-    envs: Annotated[int | None, typer.Option(help="Worlds of each process; default: 256 for PPO, 64 for SHAC.")] = None,
+    envs: Annotated[int, typer.Option(help="Worlds of each process.")] = 64,
     workers: Annotated[int, typer.Option(help="PPO: processes that collect.")] = 1,
     ray: Annotated[int, typer.Option(help="PPO: Ray collectors instead, on one machine or a cluster (extra 'ray').")] = 0,
     dtype: Annotated[Dtype, typer.Option(help="Of the simulation.")] = Dtype.FLOAT64,
@@ -35,11 +35,11 @@ def train(
     threads: Annotated[int, typer.Option(help="PyTorch's threads inside an operation.")] = 1,
 ) -> None:
     """Trains a controller. Interrupted at any time, it keeps what the last batch left; --resume goes on from there."""
+    from pbfd_torch.learning.curve import trailing
     from pbfd_torch.learning.training_env import EnvSettings
 
     use_threads(threads)
-    worlds = envs or (256 if method is Method.PPO else 64)
-    where = EnvSettings(env, worlds, seed, dtype.value, control_dt, dt)
+    where = EnvSettings(env, envs, seed, dtype.value, control_dt, dt)
     trainer: Any
     if method is Method.PPO:
         from pbfd_torch.learning.ppo import Ppo, PpoTrainer
@@ -52,7 +52,7 @@ def train(
     with tqdm(total=frames, unit="step", initial=trainer.folder.frames, disable=not sys.stderr.isatty(), leave=False) as bar:
 
         def progress(row: Any) -> None:
-            bar.set_postfix_str(f"return {row.mean_return:.0f}, {row.episodes} episodes")
+            bar.set_postfix_str(f"return {trailing(trainer.folder.rows)[-1]:.0f}")
             bar.update(row.frames - bar.n)
 
         try:
@@ -63,6 +63,6 @@ def train(
     said = (
         "nothing learnt yet"
         if last is None
-        else f"mean return {last.mean_return:.1f} after {last.frames} steps, {last.seconds / 60:.1f} min"
+        else f"mean return of the last 64 episodes {trailing(rows)[-1]:.1f} after {last.frames} steps, {last.seconds / 60:.1f} min"
     )
     print(f"{said}; written to {out}")

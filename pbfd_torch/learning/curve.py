@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import os
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -77,20 +78,37 @@ def _row(row: Mapping[str, str]) -> Row:
     return Row(**numbers)
 
 
+def trailing(rows: Sequence[Row], episodes: int = 64) -> list[float]:
+    """Mean return of the last episodes up to each row, at least so many or all there have been; NaN before the first. A batch alone
+    may end a handful of episodes only, short ones more often than long ones."""
+    kept: deque[Row] = deque()
+    count, total = 0, 0.0
+    means: list[float] = []
+    for row in rows:
+        if row.episodes:
+            kept.append(row)
+            count, total = count + row.episodes, total + row.episodes * row.mean_return
+        while kept and count - kept[0].episodes >= episodes:
+            old = kept.popleft()
+            count, total = count - old.episodes, total - old.episodes * old.mean_return
+        means.append(total / count if count else math.nan)
+    return means
+
+
 def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
-    """Mean return over environment steps and over time, each curve with the range of its episodes."""
+    """Mean return over environment steps and over time, `trailing`, each curve with the range of its batches' episodes."""
     figure = Figure(figsize=(11, 4.2), dpi=130, layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for k, (name, rows) in enumerate(curves.items()):
         ended = [row for row in rows if row.episodes]
         if not ended:
             continue
-        values = np.array([row.mean_return for row in ended])
+        values = np.array(trailing(ended))
         low, high = (np.array([getattr(row, what) for row in ended]) for what in ("lowest_return", "highest_return"))
         for axis, x in zip(axes, ([r.frames for r in ended], [r.seconds / 60 for r in ended]), strict=True):
             axis.plot(x, values, color=f"C{k}", label=name)
             axis.fill_between(x, low, high, color=f"C{k}", alpha=0.15, linewidth=0)
-    axes[0].set(xlabel="environment steps", ylabel="return of finished episodes", title=title)
+    axes[0].set(xlabel="environment steps", ylabel="return of the last 64 episodes", title=title)
     axes[1].set(xlabel="minutes of training")
     for axis in axes:
         axis.grid(alpha=0.3)

@@ -93,7 +93,7 @@ def tried(
     kept = [(q[:SHOWN], v[:SHOWN])]
     with torch.no_grad():
         for k in range(env.max_episode_steps):
-            action = policy(env.observe(q, v)).to(q.dtype).clamp(env._low, env._high)
+            action = policy(env.observe(q, v)).to(q.dtype).clamp(env.low, env.high)
             before = q
             after, velocity, solved = worlds.step(action)
             q = torch.where((alive & solved)[:, None], after, q)

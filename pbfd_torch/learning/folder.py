@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,6 +16,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.learning import curve
 
 FORMAT = "pbfd_torch policy 1"
+PICTURE_EVERY = 30.0  # [s]
 CHECKPOINT, CURVE, PICTURE = "checkpoint.pt", "curve.csv", "curve.png"
 
 
@@ -25,7 +28,7 @@ class Folder:
     def __init__(self, path: Path, method: str, resume: bool) -> None:
         self.path, self.method = path, method
         self.rows: list[curve.Row] = []
-        self.seconds = 0.0
+        self.seconds, self._drawn, self._title = 0.0, -math.inf, ""
         self.saved: dict[str, Any] | None = None
         checkpoint = path / CHECKPOINT
         if checkpoint.exists():
@@ -44,8 +47,13 @@ class Folder:
         """Environment steps so far."""
         return self.rows[-1].frames if self.rows else 0
 
+    def fall(self, decay: int) -> float:
+        """What is left of a learning rate: from 1, in a line, to a tenth after `decay` environment steps, and so on from there."""
+        return max(0.1, 1 - 0.9 * self.frames / decay)
+
     def write(self, settings: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
         """Everything there is to go on with. `settings` holds those of the environment under "env", and the networks' "width"."""
+        self._title = settings["env"]["name"]
         part = self.path / f"{CHECKPOINT}.part"
         torch.save(
             {
@@ -61,7 +69,13 @@ class Folder:
         )
         os.replace(part, self.path / CHECKPOINT)
         curve.save(self.rows, self.path / CURVE)
-        curve.draw({self.method: self.rows}, self.path / PICTURE, settings["env"]["name"])
+        if time.monotonic() - self._drawn > PICTURE_EVERY:
+            self.draw()
+
+    def draw(self) -> None:
+        """The picture of the curve so far: takes longer than the rest, so `write` does it now and then only."""
+        curve.draw({self.method: self.rows}, self.path / PICTURE, self._title)
+        self._drawn = time.monotonic()
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -29,16 +29,18 @@ class Ppo:
     """Attributes:
     env: where.
     horizon: steps of each world per batch. epochs, minibatch: of the updates.
-    learning_rate, gamma, lmbda, clip, entropy, width: the usual ones; width: of both networks' two hidden layers.
+    learning_rate: falling to a tenth over `decay` environment steps, and staying there.
+    gamma, lmbda, clip, entropy, width: the usual ones; width: of both networks' two hidden layers.
     workers: processes that collect, each with `env.num_envs` worlds. ray: remote collectors instead, on one machine or many.
     """
 
     env: EnvSettings
     horizon: int = 32
     epochs: int = 10
-    minibatch: int = 2048
+    minibatch: int = 64
     learning_rate: float = 3e-4
-    gamma: float = 0.99
+    decay: int = 400_000
+    gamma: float = 0.995
     lmbda: float = 0.95
     clip: float = 0.2
     entropy: float = 0.0
@@ -47,9 +49,11 @@ class Ppo:
     ray: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("horizon", "epochs", "minibatch", "width", "workers"):
+        for name in ("horizon", "epochs", "minibatch", "decay", "width", "workers"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+        if not 0 <= self.gamma < 1:
+            raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")
         if self.ray < 0 or (self.ray and self.workers > 1):
             raise InputError(f"ray is {self.ray} and workers {self.workers}: give one of the two")
 
@@ -124,12 +128,17 @@ class PpoTrainer:
                     break
         finally:
             collector.shutdown()
+            self.folder.draw()
         return self.folder.rows
 
     def _learn(self, batch: TensorDictBase) -> float:
         """Some epochs over a batch `[worlds, steps]`; the last loss."""
         s = self.settings
+        self.optimiser.param_groups[0]["lr"] = s.learning_rate * self.folder.fall(s.decay)
         last = math.nan
+        # the critic learns a mean reward, not a sum of 1 / (1 − γ) of them: numbers that a fresh network gives
+        batch = batch.clone(recurse=False)
+        batch["next", "reward"] = (1 - s.gamma) * batch["next", "reward"]
         keys = [SEEN, "action", "action_log_prob", "loc", "scale", "reward", "done", "terminated"]
         for _ in range(s.epochs):
             with torch.no_grad():

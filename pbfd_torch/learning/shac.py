@@ -1,7 +1,8 @@
 """A short-horizon actor–critic that follows the simulator's gradients, after Xu et al. (2022).
 
 The actor climbs the return of a few steps plus the critic's value of where they lead, differentiated through the simulation; the
-critic learns returns over the same steps, TD(λ), as seen by a slowly following copy of itself.
+critic learns returns over the same steps, TD(λ), as seen by a slowly following copy of itself. It gives returns as a mean reward,
+(1 − γ) times their sum, which is of the size of what a fresh network gives.
 """
 
 from __future__ import annotations
@@ -19,10 +20,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from pbfd_torch.envs.packing import unpacked
 from pbfd_torch.errors import InputError
 from pbfd_torch.implicit import Doubtful, Gradients
-from pbfd_torch.integrators.integrator import State
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
@@ -46,7 +45,7 @@ class Shac:
     critic_rate: float = 2e-3
     decay: int = 1_000_000
     epochs: int = 8
-    gamma: float = 0.99
+    gamma: float = 0.995
     lmbda: float = 0.95
     width: int = 64
     following: float = 0.4
@@ -56,6 +55,8 @@ class Shac:
         for name in ("horizon", "epochs", "width", "decay"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+        if not 0 <= self.gamma < 1:
+            raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,31 +94,30 @@ class ShacTrainer:
                 part.load_state_dict(self.folder.saved[name])
             self.shared.update_(self.folder.saved["statistics"])
         worlds = settings.env.num_envs
-        self._state, self._steps = self._fresh(worlds)
-        self._return = torch.zeros(worlds)
-
-    def _fresh(self, worlds: int) -> tuple[State, Tensor]:
-        flat = self.env._taken(worlds)
-        return unpacked(flat, self.env._like), flat["steps"].squeeze(-1)
+        self._state, self._observation = self.env.starts(worlds)
+        self._steps, self._return = torch.zeros(worlds, dtype=torch.int64), torch.zeros(worlds)
 
     def run(self, frames: int, minutes: float = math.inf, progress: Callable[[curve.Row], object] | None = None) -> list[curve.Row]:
         """See `PpoTrainer.run`."""
         started = time.perf_counter() - self.folder.seconds
-        while self.folder.frames < frames and self.folder.seconds < 60 * minutes:
-            fall = max(0.1, 1 - 0.9 * self.folder.frames / self.settings.decay)
-            for optimiser, rate in (
-                (self.actor_optimiser, self.settings.actor_rate),
-                (self.critic_optimiser, self.settings.critic_rate),
-            ):
-                optimiser.param_groups[0]["lr"] = fall * rate
-            leg, row = self._act()
-            loss = self._judge(leg)
-            self.folder.seconds = time.perf_counter() - started
-            self.folder.rows.append(curve.Row(seconds=self.folder.seconds, loss=loss, **row))
-            states = {name: part.state_dict() for name, part in self._parts.items()}
-            self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
-            if progress is not None:
-                progress(self.folder.rows[-1])
+        try:
+            while self.folder.frames < frames and self.folder.seconds < 60 * minutes:
+                fall = self.folder.fall(self.settings.decay)
+                for optimiser, rate in (
+                    (self.actor_optimiser, self.settings.actor_rate),
+                    (self.critic_optimiser, self.settings.critic_rate),
+                ):
+                    optimiser.param_groups[0]["lr"] = fall * rate
+                leg, row = self._act()
+                loss = self._judge(leg)
+                self.folder.seconds = time.perf_counter() - started
+                self.folder.rows.append(curve.Row(seconds=self.folder.seconds, loss=loss, **row))
+                states = {name: part.state_dict() for name, part in self._parts.items()}
+                self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
+                if progress is not None:
+                    progress(self.folder.rows[-1])
+        finally:
+            self.folder.draw()
         return self.folder.rows
 
     def _value(self, critic: Any, seen: Tensor) -> Tensor:
@@ -127,12 +127,11 @@ class ShacTrainer:
         """Some steps, and one of the actor along their gradient."""
         s, env = self.settings, self.env
         loc, scale = location_and_scale(plain(self.shared))
-        state = mapped(lambda x: x.detach(), self._state)
+        state, observation = self._state, self._observation
         worlds = s.env.num_envs
         gain, discount = torch.zeros(worlds), torch.ones(worlds)
         parts: list[tuple[Tensor, ...]] = []
         returns, lengths, unsolved = [], [], 0
-        observation = env.observe(state.q, env._velocity(env.simulator, state))
         for k in range(s.horizon):
             seen_more(self.shared, observation.detach().float())
             seen = (observation.float() - loc) / scale
@@ -145,7 +144,7 @@ class ShacTrainer:
             reward = outcome.reward.float()
             gain = gain + discount * reward
             last = torch.full_like(ended, k == s.horizon - 1)
-            ahead = torch.where(outcome.terminated, 0.0, self._value(self.target, after))
+            ahead = torch.where(outcome.terminated, 0.0, self._value(self.target, after)) / (1 - s.gamma)
             gain = gain + torch.where(ended | last, discount * s.gamma * ahead, 0.0)
             discount = torch.where(ended, 1.0, discount * s.gamma)
             parts.append((seen.detach(), after.detach(), reward.detach(), outcome.terminated, ended))
@@ -155,13 +154,12 @@ class ShacTrainer:
             lengths.append(self._steps[ended].float())
             state, observation = outcome.state, outcome.observation
             if bool(ended.any()):
-                fresh, steps = self._fresh(worlds)
+                fresh, begun = env.starts(worlds)
                 state = chosen(ended, fresh, state)
-                begun = env.observe(fresh.q, env._velocity(env.simulator, fresh))
                 observation = torch.where(ended[:, None], begun, observation)
-                self._steps = torch.where(ended, steps, self._steps)
+                self._steps = torch.where(ended, 0, self._steps)
                 self._return = torch.where(ended, 0.0, self._return)
-        self._state = mapped(lambda x: x.detach(), state)
+        self._state, self._observation = mapped(lambda x: x.detach(), state), observation.detach()
         self.actor_optimiser.zero_grad()
         (-gain.mean() / s.horizon).backward()
         for parameter in self.actor.parameters():  # a step at the edge of being singular must not undo what was learnt
@@ -185,13 +183,13 @@ class ShacTrainer:
             goals = [ahead[-1]]
             for k in reversed(range(s.horizon)):
                 carried = torch.where(leg.ended[k], ahead[k], (1 - s.lmbda) * ahead[k] + s.lmbda * goals[-1])
-                goals.append(leg.reward[k] + s.gamma * carried)
+                goals.append((1 - s.gamma) * leg.reward[k] + s.gamma * carried)
             goal = torch.stack(goals[:0:-1]).flatten()
         seen = leg.seen.flatten(0, 1)
         last = math.nan
         for _ in range(s.epochs):
             for part in torch.randperm(len(goal)).chunk(4):
-                loss = torch.nn.functional.smooth_l1_loss(self._value(self.critic, seen[part]), goal[part])
+                loss = torch.nn.functional.mse_loss(self._value(self.critic, seen[part]), goal[part])
                 self.critic_optimiser.zero_grad()
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(self.critic.parameters(), s.largest)

@@ -25,7 +25,7 @@ class EnvSettings:
     """Which environment, and how: see `PbfdEnv`. dtype: "float64" or "float32"."""
 
     name: str
-    num_envs: int = 1024
+    num_envs: int = 64
     seed: int = 0
     dtype: str = "float64"
     control_dt: float | None = None
