@@ -90,6 +90,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
     batch_locked = True
     task_dt = 0.008
     task_steps = 1000
+    planar = True  # moves in the x–z plane
 
     def __init__(
         self,

@@ -27,6 +27,11 @@ ENVIRONMENTS: dict[str, type[PbfdEnv]] = {
 
 def make_env(name: str, **arguments: Any) -> PbfdEnv:
     """An environment by name; raises `InputError` for an unknown one. Arguments: see `PbfdEnv`."""
+    return env_class(name)(**arguments)
+
+
+def env_class(name: str) -> type[PbfdEnv]:
+    """The class of an environment by name; raises `InputError` for an unknown one."""
     if name not in ENVIRONMENTS:
         raise InputError(f"no environment named '{name}': must be one of {', '.join(ENVIRONMENTS)}")
-    return ENVIRONMENTS[name](**arguments)
+    return ENVIRONMENTS[name]

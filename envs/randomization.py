@@ -48,6 +48,11 @@ class Randomization:
         if not 0 <= self.push_probability <= 1:
             raise InputError(f"push_probability is {self.push_probability}: must be from 0 to 1")
 
+    @property
+    def nothing(self) -> bool:
+        """Whether all worlds are alike."""
+        return self == Randomization(planar=self.planar)
+
     def drawn(self, worlds: int, random: torch.Generator) -> dict[str, Tensor]:
         """Factors of mass, friction and gain `[worlds, 3]`, and no push yet, `[worlds, 3]` [N]."""
         low, high = torch.tensor([self.mass, self.friction, self.gain], dtype=torch.float64, device=random.device).unbind(-1)

@@ -24,6 +24,7 @@ class UprightEnv(PbfdEnv):
     of upright."""
 
     file = ""
+    planar = False
     lowest = 0.8
     fastest = 3.0
 

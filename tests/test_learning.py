@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from pbfd_torch import InputError, Rollout
-from pbfd_torch.envs import make_env
+from pbfd_torch.envs import Randomization, make_env
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.evaluation import Policy, draw, tried
 from pbfd_torch.learning.folder import load_checkpoint
@@ -92,6 +92,33 @@ def test_a_killed_training_is_gone_on_with(tmp_path: Path) -> None:
     after = load_checkpoint(tmp_path / "checkpoint.pt")["rows"]
     assert after[: len(before)] == before
     assert len(after) == len(before) + 1
+
+
+def test_randomised_training(tmp_path: Path) -> None:
+    """`pbfd train` with ranges and pushes: the checkpoint says so, and gives the policy's settings back; SHAC refuses."""
+    command = [
+        sys.executable,
+        "-m",
+        "pbfd_torch.cli.main",
+        "train",
+        "cart-pole",
+        "--out",
+        str(tmp_path),
+        "--envs",
+        "4",
+        "--frames",
+        "1",
+    ]
+    chances = ["--mass", "0.5", "1.5", "--friction", "0.9", "1", "--push", "2"]
+    subprocess.run([*command, *chances], capture_output=True, text=True, check=True)
+    policy = Policy.load(tmp_path / "checkpoint.pt")
+    wanted = Randomization(mass=(0.5, 1.5), friction=(0.9, 1.0), push=2.0, push_probability=0.02)
+    assert policy.settings.randomization == wanted
+    env = policy.settings.make()
+    assert env.randomization == wanted
+    assert float(env.reset()["state", "world_factors"][:, 0].std()) > 0
+    with pytest.raises(InputError, match="it must be None"):
+        Shac(policy.settings)
 
 
 def test_two_processes_collect(tmp_path: Path) -> None:
@@ -235,6 +262,18 @@ def test_the_command_evaluates(trained: Path, tmp_path: Path) -> None:
     assert {x.name for x in tmp_path.iterdir()} == {"returns.png", "returns.json", *(f"pole-{on}.npz" for on in SIMULATORS)}
 
 
+def test_the_trailing_mean_counts_episodes() -> None:
+    """Over the last four episodes or more, batches without any left out; NaN before the first."""
+    rows = [
+        curve.Row(k, 0.0, n, mean, mean, mean, 1.0, 0.0, 0.0, 0.0)
+        for k, (n, mean) in enumerate(((0, math.nan), (2, 1.0), (3, 6.0)))
+    ]
+    rows += [dataclasses.replace(rows[0], frames=4), dataclasses.replace(rows[1], episodes=1, mean_return=10.0)]
+    found = curve.trailing(rows, episodes=4)
+    assert math.isnan(found[0])
+    assert found[1:] == [1.0, 4.0, 4.0, 7.0]
+
+
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     """Missing, foreign, damaged, and one that would run code."""
     with pytest.raises(InputError, match="no checkpoint at"):
@@ -255,6 +294,7 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     [
         (lambda: Ppo(POLE, horizon=0), "horizon is 0"),
         (lambda: Ppo(POLE, workers=2, ray=2), "give one of the two"),
+        (lambda: Ppo(POLE, gamma=1.0), "gamma is 1.0"),
         (lambda: Shac(POLE, epochs=0), "epochs is 0"),
         (lambda: EnvSettings("ant").make(), "no environment named 'ant'"),
     ],

@@ -12,6 +12,8 @@ from tqdm import tqdm
 
 from pbfd_torch.cli.options import Dtype, use_threads
 
+PUSH_PROBABILITY = 0.02  # per control step
+
 
 class Method(enum.StrEnum):
     PPO = "ppo"
@@ -32,14 +34,21 @@ def train(
     dtype: Annotated[Dtype, typer.Option(help="Of the simulation.")] = Dtype.FLOAT64,
     control_dt: Annotated[float | None, typer.Option(help="Seconds between actions; default: the task's.")] = None,
     dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: one per action.")] = None,
+    mass: Annotated[tuple[float, float], typer.Option(help="Range of a factor of all masses, drawn by each world.")] = (1.0, 1.0),
+    friction: Annotated[tuple[float, float], typer.Option(help="Likewise of μ.")] = (1.0, 1.0),
+    gain: Annotated[tuple[float, float], typer.Option(help="Likewise of what actuators give.")] = (1.0, 1.0),
+    push: Annotated[float, typer.Option(help="Newtons of pushes that begin or end in every fiftieth step or so.")] = 0.0,
     threads: Annotated[int, typer.Option(help="PyTorch's threads inside an operation.")] = 1,
 ) -> None:
     """Trains a controller. Interrupted at any time, it keeps what the last batch left; --resume goes on from there."""
+    from pbfd_torch.envs.named import env_class
+    from pbfd_torch.envs.randomization import Randomization
     from pbfd_torch.learning.curve import trailing
     from pbfd_torch.learning.training_env import EnvSettings
 
     use_threads(threads)
-    where = EnvSettings(env, envs, seed, dtype.value, control_dt, dt)
+    chances = Randomization(mass, friction, gain, push, PUSH_PROBABILITY if push else 0.0, planar=env_class(env).planar)
+    where = EnvSettings(env, envs, seed, dtype.value, control_dt, dt, randomization=None if chances.nothing else chances)
     trainer: Any
     if method is Method.PPO:
         from pbfd_torch.learning.ppo import Ppo, PpoTrainer

@@ -35,7 +35,7 @@ class Policy:
     def load(path: Path) -> Policy:
         """From a checkpoint of `pbfd train`; raises `InputError` for what is none."""
         saved = load_checkpoint(path)
-        settings = EnvSettings(**saved["settings"]["env"])
+        settings = EnvSettings.of(saved["settings"]["env"])
         probe = settings.make(num_envs=1)
         actor = make_actor(probe.observation_spec["observation"].shape[-1], probe.action_spec, saved["settings"]["width"])
         actor.load_state_dict(saved["actor"])

@@ -55,6 +55,8 @@ class Shac:
         for name in ("horizon", "epochs", "width", "decay"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+        if self.env.randomization is not None:
+            raise InputError("randomization is given: gradients are followed through the scene as it is, so it must be None")
         if not 0 <= self.gamma < 1:
             raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import VecNormV2
 
-from pbfd_torch.envs import make_env
+from pbfd_torch.envs import Randomization, make_env
 from pbfd_torch.learning.networks import SEEN
 
 _DECAY = 0.99995  # of the running mean and variance, per step of all worlds
@@ -22,7 +22,7 @@ _LEAST = 1e-4  # scale
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Which environment, and how: see `PbfdEnv`. dtype: "float64" or "float32"."""
+    """Which environment, and how: see `PbfdEnv`. dtype: "float64" or "float32". randomization: of the worlds in training."""
 
     name: str
     num_envs: int = 64
@@ -31,10 +31,17 @@ class EnvSettings:
     control_dt: float | None = None
     dt: float | None = None
     max_episode_steps: int | None = None
+    randomization: Randomization | None = None
+
+    @staticmethod
+    def of(saved: Mapping[str, Any]) -> EnvSettings:
+        """The settings that `asdict` has made plain."""
+        chances = saved.get("randomization")
+        return EnvSettings(**{**saved, "randomization": chances and Randomization(**chances)})
 
     def make(self, **changes: Any) -> Any:
         """The environment itself."""
-        given = {name: value for name, value in asdict(self).items() if name not in ("name", "dtype")}
+        given = {x.name: getattr(self, x.name) for x in fields(self) if x.name not in ("name", "dtype")}
         return make_env(self.name, dtype=getattr(torch, self.dtype), **(given | changes))
 
 
