@@ -26,6 +26,7 @@ from pbfd_torch.terms.actuators import Actuators
 
 DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
 KEPT = ("start_v", *DRAWN)  # of an episode, from its start
+HALVINGS = 1  # of a step that nothing else solves
 POOL = 256  # starts that are made at once, at most 16 for each world, unless more are needed: a solve each
 
 
@@ -118,7 +119,8 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.randomization = randomization
         self.setup = self.make_setup(dtype, torch.device(device))
         self.scene = self.setup.scene
-        self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler())
+        # a world that is hard to solve ends sooner than others wait for it
+        self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler(), halvings=HALVINGS)
         (bank,) = (term for term in self.scene.terms if isinstance(term, Actuators))
         self.low, self.high = bank.control_range.unbind(-1)
         if not bool(torch.isfinite(bank.control_range).all()):
@@ -289,7 +291,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         if self.randomization is None or drawn is None:
             return self.simulator
         scene = self.randomization.applied(self.scene, {name: drawn[name] for name in DRAWN})
-        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver)
+        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver, HALVINGS)
 
     def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
         """Packed states at q with v, at the first step of an episode."""

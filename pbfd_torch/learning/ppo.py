@@ -21,7 +21,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
-from pbfd_torch.learning.training_env import EnvSettings, plain, statistics, training_env
+from pbfd_torch.learning.training_env import EnvSettings, check, plain, statistics, training_env
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,7 @@ class Ppo:
     ray: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("horizon", "epochs", "minibatch", "decay", "width", "workers"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
-        if not 0 <= self.gamma < 1:
-            raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")
+        check(self.gamma, {name: getattr(self, name) for name in ("horizon", "epochs", "minibatch", "decay", "width", "workers")})
         if self.ray < 0 or (self.ray and self.workers > 1):
             raise InputError(f"ray is {self.ray} and workers {self.workers}: give one of the two")
 

@@ -25,7 +25,7 @@ from pbfd_torch.implicit import Doubtful, Gradients
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
-from pbfd_torch.learning.training_env import EnvSettings, location_and_scale, plain, seen_more, statistics
+from pbfd_torch.learning.training_env import EnvSettings, check, location_and_scale, plain, seen_more, statistics
 from pbfd_torch.solvers.per_world import chosen, mapped
 
 
@@ -52,13 +52,9 @@ class Shac:
     largest: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("horizon", "epochs", "width", "decay"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+        check(self.gamma, {name: getattr(self, name) for name in ("horizon", "epochs", "width", "decay")})
         if self.env.randomization is not None:
             raise InputError("randomization is given: gradients are followed through the scene as it is, so it must be None")
-        if not 0 <= self.gamma < 1:
-            raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")
 
 
 @dataclass(frozen=True, eq=False)
