@@ -45,7 +45,7 @@ class Shac:
     critic_rate: float = 2e-3
     decay: int = 1_000_000
     epochs: int = 8
-    gamma: float = 0.995
+    gamma: float = 0.99
     lmbda: float = 0.95
     width: int = 64
     following: float = 0.4
