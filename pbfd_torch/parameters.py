@@ -32,7 +32,8 @@ def parameters(scene: Scene) -> dict[str, Tensor]:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Tensor]) -> Scene:
-    """The scene with the numbers of these names replaced; they may require gradients and have one row per world. It is not
+    """The scene with the numbers of these names replaced; they may require gradients. With one value per world, rows
+    `[*batch]` come before the shape it has: a μ of one number takes `[worlds, 1]`, since it is the same for all contacts. It is not
     validated again: masses and inertias must stay physical (`pseudo_inertia_of` sees to that). Raises `InputError` for an unknown
     name, and for a dtype or device that is not the scene's."""
     like = scene.articulation

@@ -52,6 +52,9 @@ def test_ppo_learns(trained: Path) -> None:
     assert (trained / "curve.png").stat().st_size > 10_000
     saved = load_checkpoint(trained / "checkpoint.pt")
     assert saved["rows"][-1]["frames"] == 25_600
+    means = curve.trailing(rows)
+    best = max(range(25), key=lambda k: -math.inf if math.isnan(means[k]) else means[k])
+    assert load_checkpoint(trained / "best.pt")["rows"][-1]["frames"] == rows[best].frames
 
 
 @pytest.mark.parametrize("trainer", [PpoTrainer, ShacTrainer])

@@ -1,9 +1,12 @@
-"""The folder of a training: checkpoint, curve and picture, each written whole, and gone on with after an interruption."""
+"""The folder of a training: checkpoints, curve and picture, each written whole, and gone on with after an interruption.
+
+Beside the last checkpoint there is the best: the one at which the mean return of the last 64 episodes was highest."""
 
 from __future__ import annotations
 
 import math
 import os
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,7 +20,7 @@ from pbfd_torch.learning import curve
 
 FORMAT = "pbfd_torch policy 1"
 PICTURE_EVERY = 30.0  # [s]
-CHECKPOINT, CURVE, PICTURE = "checkpoint.pt", "curve.csv", "curve.png"
+CHECKPOINT, BEST, CURVE, PICTURE = "checkpoint.pt", "best.pt", "curve.csv", "curve.png"
 
 
 class Folder:
@@ -67,6 +70,10 @@ class Folder:
             },
             part,
         )
+        means = curve.trailing(self.rows)
+        if means[-1] == max(x for x in (-math.inf, *means) if not math.isnan(x)):
+            shutil.copyfile(part, self.path / f"{BEST}.part")
+            os.replace(self.path / f"{BEST}.part", self.path / BEST)
         os.replace(part, self.path / CHECKPOINT)
         curve.save(self.rows, self.path / CURVE)
         if time.monotonic() - self._drawn > PICTURE_EVERY:
