@@ -291,7 +291,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         if self.randomization is None or drawn is None:
             return self.simulator
         scene = self.randomization.applied(self.scene, {name: drawn[name] for name in DRAWN})
-        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver, HALVINGS)
+        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver, self.simulator.halvings)
 
     def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
         """Packed states at q with v, at the first step of an episode."""

@@ -20,7 +20,7 @@ from pbfd_torch import InputError, Rollout
 from pbfd_torch.envs import Randomization, make_env
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.evaluation import Policy, draw, tried
-from pbfd_torch.learning.folder import load_checkpoint
+from pbfd_torch.learning.folder import Folder, load_checkpoint
 from pbfd_torch.learning.ppo import Ppo, PpoTrainer
 from pbfd_torch.learning.shac import Shac, ShacTrainer
 from pbfd_torch.learning.training_env import EnvSettings, location_and_scale, plain, seen_more, statistics, training_env
@@ -99,21 +99,9 @@ def test_a_killed_training_is_gone_on_with(tmp_path: Path) -> None:
 
 def test_randomised_training(tmp_path: Path) -> None:
     """`pbfd train` with ranges and pushes: the checkpoint says so, and gives the policy's settings back; SHAC refuses."""
-    command = [
-        sys.executable,
-        "-m",
-        "pbfd_torch.cli.main",
-        "train",
-        "cart-pole",
-        "--out",
-        str(tmp_path),
-        "--envs",
-        "4",
-        "--frames",
-        "1",
-    ]
+    command = [sys.executable, "-m", "pbfd_torch.cli.main", "train", "cart-pole", "--out", str(tmp_path)]
     chances = ["--mass", "0.5", "1.5", "--friction", "0.9", "1", "--push", "2"]
-    subprocess.run([*command, *chances], capture_output=True, text=True, check=True)
+    subprocess.run([*command, "--envs", "4", "--frames", "1", *chances], capture_output=True, text=True, check=True)
     policy = Policy.load(tmp_path / "checkpoint.pt")
     wanted = Randomization(mass=(0.5, 1.5), friction=(0.9, 1.0), push=2.0, push_probability=0.02)
     assert policy.settings.randomization == wanted
@@ -172,11 +160,10 @@ def test_gradients_of_the_return_are_right(name: str) -> None:
 
 
 def test_shac_learns(tmp_path: Path) -> None:
-    """The reacher's cost per step falls by a quarter within 20 000 steps, and nothing is unsolved."""
+    """The reacher's cost per step falls by a third within 20 000 steps, and nothing is unsolved."""
     rows = ShacTrainer(Shac(EnvSettings("reacher", num_envs=64, seed=1), horizon=8), tmp_path).run(20_000)
-    assert (
-        max(row.reward for row in rows[20:]) > 0.75 * rows[0].reward
-    )  # all worlds begin anew every 12 batches, so it goes up and down
+    # all worlds begin anew every 12 batches, so it goes up and down
+    assert max(row.reward for row in rows[20:]) > 0.67 * rows[0].reward
     assert all(math.isfinite(row.loss) and row.unsolved == 0 for row in rows)
 
 
@@ -275,6 +262,17 @@ def test_the_trailing_mean_counts_episodes() -> None:
     found = curve.trailing(rows, episodes=4)
     assert math.isnan(found[0])
     assert found[1:] == [1.0, 4.0, 4.0, 7.0]
+
+
+def test_the_best_checkpoint_is_the_one_that_was_measured(tmp_path: Path) -> None:
+    """A batch in which no episode ends, or worse ones do, leaves the best checkpoint alone."""
+    folder = Folder(tmp_path, "PPO", "pole", resume=False)
+    for frames, episodes, mean in ((1, 0, math.nan), (2, 64, 5.0), (3, 0, math.nan), (4, 64, 4.0), (5, 64, 6.0), (6, 0, math.nan)):
+        folder.rows.append(curve.Row(frames, 1.0, episodes, mean, mean, mean, 1.0, 0.0, 0.0, 0.0))
+        folder.write({}, {})
+        assert (tmp_path / "best.pt").exists() == (frames > 1)
+        if frames > 1:
+            assert load_checkpoint(tmp_path / "best.pt")["rows"][-1]["frames"] == (2 if frames < 5 else 5)
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:

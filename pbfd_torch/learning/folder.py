@@ -24,14 +24,14 @@ CHECKPOINT, BEST, CURVE, PICTURE = "checkpoint.pt", "best.pt", "curve.csv", "cur
 
 
 class Folder:
-    """Holds the curve so far, and what was `saved` where a training is gone on with.
+    """Holds the curve so far, whose picture has a `title`, and what was `saved` where a training is gone on with.
 
     Raises `InputError` where the folder holds a training and `resume` is not set, and for a checkpoint of another method."""
 
-    def __init__(self, path: Path, method: str, resume: bool) -> None:
-        self.path, self.method = path, method
+    def __init__(self, path: Path, method: str, title: str, resume: bool) -> None:
+        self.path, self.method, self.title = path, method, title
         self.rows: list[curve.Row] = []
-        self.seconds, self._drawn, self._title = 0.0, -math.inf, ""
+        self.seconds, self._drawn = 0.0, -math.inf
         self.saved: dict[str, Any] | None = None
         checkpoint = path / CHECKPOINT
         if checkpoint.exists():
@@ -56,7 +56,6 @@ class Folder:
 
     def write(self, settings: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
         """Everything there is to go on with. `settings` holds those of the environment under "env", and the networks' "width"."""
-        self._title = settings["env"]["name"]
         part = self.path / f"{CHECKPOINT}.part"
         torch.save(
             {
@@ -70,8 +69,8 @@ class Folder:
             },
             part,
         )
-        means = curve.trailing(self.rows)
-        if means[-1] == max(x for x in (-math.inf, *means) if not math.isnan(x)):
+        means = [x for x in curve.trailing(self.rows) if not math.isnan(x)]
+        if means and means[-1] > max(means[:-1], default=-math.inf):
             shutil.copyfile(part, self.path / f"{BEST}.part")
             os.replace(self.path / f"{BEST}.part", self.path / BEST)
         os.replace(part, self.path / CHECKPOINT)
@@ -81,7 +80,7 @@ class Folder:
 
     def draw(self) -> None:
         """The picture of the curve so far: takes longer than the rest, so `write` does it now and then only."""
-        curve.draw({self.method: self.rows}, self.path / PICTURE, self._title)
+        curve.draw({self.method: self.rows}, self.path / PICTURE, self.title)
         self._drawn = time.monotonic()
 
 

@@ -66,7 +66,7 @@ class PpoTrainer:
 
     def __init__(self, settings: Ppo, path: Path, resume: bool = False) -> None:
         torch.manual_seed(settings.env.seed)
-        self.folder, self.settings = Folder(path, "PPO", resume), settings
+        self.folder, self.settings = Folder(path, "PPO", settings.env.name, resume), settings
         probe = settings.env.make(num_envs=1)
         width = probe.observation_spec["observation"].shape[-1]
         self.actor = make_actor(width, probe.action_spec, settings.width)

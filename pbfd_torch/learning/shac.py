@@ -73,7 +73,7 @@ class ShacTrainer:
 
     def __init__(self, settings: Shac, path: Path, resume: bool = False) -> None:
         torch.manual_seed(settings.env.seed)
-        self.folder, self.settings = Folder(path, "SHAC", resume), settings
+        self.folder, self.settings = Folder(path, "SHAC", settings.env.name, resume), settings
         self.env: Any = settings.env.make(seed=settings.env.seed + len(self.folder.rows))
         # a step without a derivative ends those of its world, and no other's
         self.env.simulator.gradients = Gradients(Doubtful.ZERO)
