@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from pbfd_torch.kinematics import retract
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.models import SCENES
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.simulator import Simulator
+from pbfd_torch.tree.kinematics import retract
 
 VIEWS = (
     "view",

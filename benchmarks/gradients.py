@@ -26,8 +26,8 @@ from pbfd_torch.bench.starts import scattered
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES
-from pbfd_torch.parameters import mapped_tensors, tensors_of
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
+from pbfd_torch.tensors.worlds import Worlds, replaced
 
 DT = 0.02
 PHASES = {"whole": (0, 100), "landing": (12, 20), "lying": (90, 20)}  # steps before it, steps of it

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.worlds import replaced
 
 
 def packed(state: Any) -> dict[str, Tensor]:

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.parameters import parameters, with_parameters
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.scene import Scene
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.pushes import Pushes
-from pbfd_torch.worlds import replaced
 
 Range = tuple[float, float]
 

@@ -11,7 +11,7 @@ from pbfd_torch import models
 from pbfd_torch.envs.base import PbfdEnv, Step
 from pbfd_torch.models.robots import file_setup
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 MODELS = Path(models.__file__).parent
 FASTEST = 10.0  # of observed velocities [m/s, rad/s]

@@ -9,18 +9,18 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from pbfd_torch.appearance import Visual
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider, Sphere
-from pbfd_torch.depiction import link_color, visual_of
+from pbfd_torch.looks.appearance import Visual
+from pbfd_torch.looks.painting import link_color, visual_of
 from pbfd_torch.models.setup import Metric, Setup, repeated
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 GRAVITY = 9.81
 HALF = (0.1, 0.1, 0.05)  # half extents of the box [m]

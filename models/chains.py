@@ -12,21 +12,21 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from pbfd_torch.appearance import Visual
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.balance.dynamics import momentum
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Capsule, Collider, Point
-from pbfd_torch.depiction import link_color, visual_of
-from pbfd_torch.dynamics import momentum
-from pbfd_torch.kinematics import Motion, place
+from pbfd_torch.looks.appearance import Visual
+from pbfd_torch.looks.painting import link_color, visual_of
 from pbfd_torch.models.setup import Metric, Setup, repeated, tilted
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import Motion, place
 
 GRAVITY = 9.81
 LENGTH, RADIUS, MASS = 0.1, 0.02, 0.1

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.mesh_distance import Mesh
 from pbfd_torch.contact.motion import Conveyor, Turntable
@@ -17,11 +16,12 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Collider, Cylinder, Sphere
 from pbfd_torch.models.setup import Metric, Setup, repeated
 from pbfd_torch.models.stacks import GRAVITY, solid_box
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation
 
 HALF = (0.1, 0.1, 0.05)  # half extents of every box [m]
 STIFFNESS = 1e8

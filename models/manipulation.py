@@ -9,18 +9,18 @@ from pathlib import Path
 
 import torch
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.shapes import Box, Capsule, Collider
 from pbfd_torch.loading import load_robot
 from pbfd_torch.loading.scene import robot_scene
 from pbfd_torch.models.setup import Metric, Setup, repeated
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 GRAVITY = 9.81
 GRIP, OBJECT_MASS, FINGER_MASS = 12.0, 0.045, 0.2  # [N] of each finger, [kg]

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import torch
 
-from pbfd_torch.appearance import Visual
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.shapes import Box
-from pbfd_torch.depiction import link_color, visual_of
+from pbfd_torch.looks.appearance import Visual
+from pbfd_torch.looks.painting import link_color, visual_of
 from pbfd_torch.models.setup import Metric, Setup, repeated
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 
 def _bar(mass: float, half: tuple[float, float, float], x: float) -> torch.Tensor:

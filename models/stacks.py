@@ -9,16 +9,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider, ConvexHull, Shape
 from pbfd_torch.models.setup import Metric, Setup, repeated
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 GRAVITY = 9.81
 HALF = (0.1, 0.1, 0.05)  # half extents of a box of the stack [m]

@@ -23,18 +23,18 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
-from pbfd_torch.articulation import pseudo_inertia
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Sphere
+from pbfd_torch.gradients.parameters import with_parameters
 from pbfd_torch.identify import Bounds, Stopping, levenberg_marquardt, linearized
-from pbfd_torch.kinematics import place
-from pbfd_torch.parameters import with_parameters
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import JointDamping
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import pseudo_inertia
+from pbfd_torch.tree.kinematics import place
 
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)

@@ -29,13 +29,13 @@ from pbfd_torch.contact.shapes import Collider, Sphere
 from pbfd_torch.identify import Case, CenterOfMass, Configurations, Experiment, Identification, Mass, Parameter, Stopping
 from pbfd_torch.identify.pictures import draw, draw_fit
 from pbfd_torch.identify.report import report
-from pbfd_torch.kinematics import retract
-from pbfd_torch.rotations import quaternion_exp
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.kinematics import retract
+from pbfd_torch.tree.rotations import quaternion_exp
 
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)

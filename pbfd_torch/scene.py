@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.appearance import Visual
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
-from pbfd_torch.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
 from pbfd_torch.errors import InputError, ModelError
-from pbfd_torch.kinematics import Motion, Placement, place
+from pbfd_torch.looks.appearance import Visual
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Conservative, Term
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Motion, Placement, place
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 
 if TYPE_CHECKING:
     from pbfd_torch.viewer import Inspector

@@ -11,26 +11,26 @@ from typing import Any, Generic, Protocol, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, force_scale
-from pbfd_torch.dynamics import bias_force, mass_matrix
+from pbfd_torch.balance.dynamics import bias_force, mass_matrix
+from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import ContactOverflowError, InputError
-from pbfd_torch.implicit import Attempt, Gradients, Parts
+from pbfd_torch.gradients.implicit import Attempt, Gradients, Parts
+from pbfd_torch.gradients.linearization import Linearization, linearized
+from pbfd_torch.gradients.linked import Linked, carries
+from pbfd_torch.gradients.trajectory import Trajectory, trajectory
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
-from pbfd_torch.linearization import Linearization, linearized
-from pbfd_torch.linked import Linked, carries
-from pbfd_torch.objective import BalanceObjective, blank_memory
-from pbfd_torch.parameters import in_dtype, tensors_of
-from pbfd_torch.recording import Recorder
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.recording import Recorder
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
 from pbfd_torch.solvers.objective import FALLBACKS, Relaxable, Solution, Status, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
-from pbfd_torch.trajectory import Trajectory, trajectory
-from pbfd_torch.way import Detour, Way
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.stepping.way import Detour, Way
+from pbfd_torch.tensors.structures import in_dtype, tensors_of
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation, force_scale
 
 SHORTEST_STEP = 1e-5  # [s]
 R = TypeVar("R", bound=State)

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.kinematics import retract
-from pbfd_torch.rotations import skew
-from pbfd_torch.topology import Topology
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import retract
+from pbfd_torch.tree.rotations import skew
+from pbfd_torch.tree.topology import Topology
 
 
 def derivative(

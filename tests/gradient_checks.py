@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import Simulator
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.integrators.integrator import Integrator
-from pbfd_torch.kinematics import difference, retract
-from pbfd_torch.parameters import parameters, with_parameters
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.tree.kinematics import difference, retract
+from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix
 from tests.finite_differences import derivative
 from tests.random_trees import generator
 

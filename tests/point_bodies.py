@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.kinematics import place
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 from tests.random_trees import generator, random_links
 
 

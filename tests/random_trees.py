@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
-from pbfd_torch.kinematics import retract
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import retract
 
 HINGE, SLIDE, BALL, FREE = JointKind.HINGE, JointKind.SLIDE, JointKind.BALL, JointKind.FREE
 

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance
+from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
-from pbfd_torch.kinematics import Placement, place
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
@@ -32,6 +30,8 @@ from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.terms.static_friction import StaticFriction
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Placement, place
 from tests.random_trees import generator, moved_q, random_q, random_tree
 from tests.states import state_of
 

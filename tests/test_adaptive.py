@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from pbfd_torch import ImplicitEuler, InputError, Simulator, Status
-from pbfd_torch.adaptive import AdaptiveSimulator, apart
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.kinematics import retract
 from pbfd_torch.models import SCENES
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.schedules.adaptive import AdaptiveSimulator, apart
+from pbfd_torch.tree.kinematics import retract
 
 FRAME = 0.05
 

@@ -18,13 +18,13 @@ from lxml import etree
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.dynamics import bias_force, mass_matrix
+from pbfd_torch.balance.dynamics import bias_force, mass_matrix
 from pbfd_torch.errors import NotModelledWarning
-from pbfd_torch.kinematics import difference, place, retract
 from pbfd_torch.loading import Robot, load_mjcf, load_urdf
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings, elastic_load
 from pbfd_torch.terms.load import StepContext
+from pbfd_torch.tree.kinematics import difference, place, retract
 
 TOLERANCE = 1e-9
 CONFIGURATIONS = 5

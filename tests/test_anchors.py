@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.asynchronous import AsynchronousRollout
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.motion import Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Collider, Cylinder
 from pbfd_torch.errors import InputError
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.scene import Scene
+from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import Relaxable, Solution

@@ -9,17 +9,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import force_scale
-from pbfd_torch.assembly import Balance
+from pbfd_torch.balance.assembly import Balance
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import link_jacobians, place, retract, subtree_sum
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.load import LinkLoad, Term
+from pbfd_torch.tree.articulation import force_scale
+from pbfd_torch.tree.kinematics import link_jacobians, place, retract, subtree_sum
 from tests.finite_differences import jacobian, relative_error
 from tests.point_bodies import point_bodies
 from tests.random_trees import SEEDS, generator, moved_q, random_q, random_tree

@@ -17,16 +17,16 @@ import pytest
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.dynamics import bias_force, mass_matrix
 from pbfd_torch.bench import mujoco_runs, mujoco_scenes, precision, precision_levels
 from pbfd_torch.bench.precision_reference import chain_tips, middle_axes
 from pbfd_torch.bench.precision_scenes import CASES, margin, middle_axis, stopped, straight_links, tenths, tip
 from pbfd_torch.bench.precision_tracks import Track, rms
-from pbfd_torch.dynamics import bias_force, mass_matrix
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.kinematics import place, retract
 from pbfd_torch.models import SCENES, Setup, boxes, chains
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.tree.kinematics import place, retract
 from tests.printed import Printed, called
 
 OURS = mujoco_scenes.NAMES[: -len(mujoco_scenes.ROBOTS)]  # whose MJCF is written here

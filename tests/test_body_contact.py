@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Shape, Sphere
-from pbfd_torch.kinematics import place
-from pbfd_torch.rotations import unskew
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import place
+from pbfd_torch.tree.rotations import unskew
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import generator, moved_q
 from tests.states import state_of

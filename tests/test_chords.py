@@ -10,14 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import JointKind
-from pbfd_torch.assembly import Balance
-from pbfd_torch.chords import ChordBalance
+from pbfd_torch.balance.assembly import Balance
+from pbfd_torch.balance.chords import ChordBalance
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fittable, Fitted, fit, fitted
-from pbfd_torch.kinematics import Chord, local_twists, place, retract
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import skew
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
@@ -25,6 +22,9 @@ from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import JointDamping, JointSprings
 from pbfd_torch.terms.load import ChordLoad, StepContext
+from pbfd_torch.tree.articulation import JointKind
+from pbfd_torch.tree.kinematics import Chord, local_twists, place, retract
+from pbfd_torch.tree.rotations import skew
 from tests.bodies import on_world
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS, generator, random_q

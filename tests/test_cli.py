@@ -21,7 +21,7 @@ import pbfd_torch.cli.demo
 import pbfd_torch.cli.options
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, SolverChoice
 from pbfd_torch.models import SCENES, Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from tests.gymnasium_files import gymnasium_file

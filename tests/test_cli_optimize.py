@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pbfd_torch.optimize.tasks import box_throw
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from tests.printed import Printed, called
 
 KEYS = {

@@ -6,11 +6,11 @@ import torch
 
 from pbfd_torch import Simulator
 from pbfd_torch.contact.shapes import Box, Sphere
-from pbfd_torch.contact_jacobians import contact_jacobians
-from pbfd_torch.kinematics import retract
+from pbfd_torch.gradients.contact_jacobians import contact_jacobians
 from pbfd_torch.models import SCENES
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.tree.kinematics import retract
 from tests.finite_differences import derivative
 from tests.touching_bodies import free_bodies, posed
 

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.hazards import Hazard, Overflow
 from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.pairing import friction_between
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.errors import ContactOverflowError, InputError
-from pbfd_torch.hazards import Hazard, Overflow
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -29,6 +28,7 @@ from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from tests.bodies import diagonal
 from tests.states import implicit
 

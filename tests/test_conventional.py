@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, JointKind
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.motion import Conveyor, Lift
 from pbfd_torch.contact.obstacle import Obstacle
@@ -31,8 +30,7 @@ from pbfd_torch.models.boxes import HALF, RADIUS, box_slide, box_slope
 from pbfd_torch.models.chains import SLIDE, chain_fixed, chain_free, chain_ground, chain_slope, chain_slope_drop
 from pbfd_torch.models.robots import hopper
 from pbfd_torch.models.stacks import stack
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import skew
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -47,6 +45,8 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.torsional_friction import TorsionalFriction
+from pbfd_torch.tree.articulation import Articulation, JointKind
+from pbfd_torch.tree.rotations import skew
 from tests.bodies import GRAVITY, at, box_inertia, down, free_body, on_ground, on_world, rises
 from tests.finite_differences import derivative
 from tests.random_trees import generator

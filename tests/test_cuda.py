@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import Rollout, Simulator
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.models import SCENES
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.solvers.descent import Descent, Progress
 from pbfd_torch.solvers.named import jtj_lm, lbfgs
 from pbfd_torch.solvers.per_world import mapped

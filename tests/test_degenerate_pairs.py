@@ -16,8 +16,8 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.polytope import polytope_of
 from pbfd_torch.contact.separation import fcl_geometries
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Sphere
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.tree.rotations import quaternion_matrix
 from tests.bodies import at, rolled_out
 from tests.random_trees import generator
 from tests.touching_bodies import free_bodies, posed

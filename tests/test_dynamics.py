@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
-from pbfd_torch.dynamics import (
+from pbfd_torch.balance.dynamics import (
     bias_force,
     center_of_mass,
     inverse_dynamics,
@@ -19,15 +18,16 @@ from pbfd_torch.dynamics import (
     potential_energy,
     rotor_energy,
 )
-from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
-from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature, JointDamping
 from pbfd_torch.terms.load import Term
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import Motion, difference, link_jacobians, place, retract
+from pbfd_torch.tree.rotations import quaternion_matrix
 from tests.point_bodies import PointBodies, point_bodies
 from tests.random_trees import SEEDS, generator, random_links, random_q, random_tree
 from tests.states import implicit

@@ -13,8 +13,7 @@ from torch import Tensor
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Sphere
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement, place, retract
-from pbfd_torch.rotations import log_jacobian_left
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor, slip_work
@@ -24,7 +23,8 @@ from pbfd_torch.terms.lagged_friction import LaggedFriction
 from pbfd_torch.terms.load import Frictional, Potential, Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.kinematics import Placement, place, retract
+from pbfd_torch.tree.rotations import log_jacobian_left
 from tests.bodies import at, diagonal, free_body
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS, moved_q

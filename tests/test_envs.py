@@ -14,16 +14,16 @@ from torchrl.envs import RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Compose, VecNormV2
 from torchrl.envs.utils import check_env_specs
 
-from pbfd_torch.dynamics import center_of_mass
+from pbfd_torch.balance.dynamics import center_of_mass
 from pbfd_torch.envs import ENVIRONMENTS, HopperEnv, PbfdEnv, Randomization, make_env
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
-from pbfd_torch.kinematics import place
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.tree.kinematics import place
 
 DTYPES = (torch.float64, torch.float32)
 

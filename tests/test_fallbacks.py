@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import chain_slope_drop
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent

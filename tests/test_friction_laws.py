@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Point
 from pbfd_torch.errors import InputError
@@ -34,6 +33,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.static_friction import StaticFriction
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from tests.states import implicit
 
 GRAVITY = 9.81

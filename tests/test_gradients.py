@@ -10,7 +10,6 @@ import torch
 
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.kinematics import difference
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -18,6 +17,7 @@ from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.static_friction import StaticFriction
+from pbfd_torch.tree.kinematics import difference
 from tests.gradient_checks import Experiment, compared
 from tests.term_cases import ROUND, TERMS, Situation, TermCase, contact, dry_torque, situation
 

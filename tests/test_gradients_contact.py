@@ -13,8 +13,8 @@ from pbfd_torch.contact.mesh_distance import Mesh
 from pbfd_torch.contact.motion import Conveyor, Lift, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Shape, Sphere
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.parameters import parameters, with_parameters
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.normal_force import NormalForce

@@ -13,27 +13,28 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from pbfd_torch import Simulator
-from pbfd_torch.adaptive import AdaptiveSimulator
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.errors import GradientError, GradientWarning, InputError
-from pbfd_torch.implicit import Blur, Doubt, Doubtful, Gradients
+from pbfd_torch.gradients.implicit import Blur, Doubt, Doubtful, Gradients
+from pbfd_torch.gradients.linearization import Chart
+from pbfd_torch.gradients.linked import Linked, Made, Step, doubts_of
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.kinematics import difference
-from pbfd_torch.linearization import Chart
-from pbfd_torch.linked import Linked, Made, Step, doubts_of
 from pbfd_torch.models import SCENES
-from pbfd_torch.parameters import in_dtype, mapped_tensors, parameters, tensors_of, with_parameters
 from pbfd_torch.scene import Scene
+from pbfd_torch.schedules.adaptive import AdaptiveSimulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import Status
+from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import difference
 from tests.bodies import diagonal
 from tests.finite_differences import derivative
 from tests.gradient_checks import precise_solver

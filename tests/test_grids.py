@@ -20,7 +20,7 @@ from pbfd_torch.contact.mesh_distance import Mesh
 from pbfd_torch.contact.splines import coefficients_through, evaluate
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 from tests.finite_differences import derivative, relative_error
 
 Array = NDArray[np.float64]

@@ -9,14 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider
 from pbfd_torch.models.grounds import BELT, BELT_FRICTION, RADII, RAMP_FRICTION, RAMPS, conveyor, ramp_grid, turntable
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import solid_box
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -25,6 +24,7 @@ from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from tests.bodies import GRAVITY, at, down, rises, rolled_out
 from tests.states import implicit
 from tests.touching_bodies import stored

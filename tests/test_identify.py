@@ -25,8 +25,8 @@ from pbfd_torch.identify import (
     Stopping,
 )
 from pbfd_torch.identify.report import report
-from pbfd_torch.kinematics import place, retract
-from pbfd_torch.rotations import quaternion_exp
+from pbfd_torch.tree.kinematics import place, retract
+from pbfd_torch.tree.rotations import quaternion_exp
 from tests.identified_scenes import DAMPING, GAIN, MU, STIFFNESS, pushed_box, servo_arm
 
 QUICK = Stopping(iterations=25, step=1e-4, decrease=1e-4)  # a hundredth of what the noise leaves open

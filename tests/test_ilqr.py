@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.errors import InputError
 from pbfd_torch.optimize import Cost, Limits, Search, Weights, ilqr, quadratic
 from pbfd_torch.optimize.box_qp import box_minimum
@@ -21,6 +20,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 MASS, DT, STEPS, WORLDS = 2.0, 0.1, 15, 3
 RUNNING, FINAL = Weights(1.0, 0.1, 0.01), Weights(10.0, 1.0)

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import InputError
-from pbfd_torch.articulation import pseudo_inertia
-from pbfd_torch.inertial import log_cholesky, mass_com_inertia, pseudo_inertia_of
 from pbfd_torch.models import SCENES
+from pbfd_torch.tree.articulation import pseudo_inertia
+from pbfd_torch.tree.inertial import log_cholesky, mass_com_inertia, pseudo_inertia_of
 
 
 def random_parameters(*batch: int, dtype: torch.dtype = torch.float64, seed: int = 0) -> Tensor:

@@ -12,28 +12,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
-from pbfd_torch.asynchronous import AsynchronousRollout
+from pbfd_torch.balance.dynamics import bias_force, mass_matrix
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box
-from pbfd_torch.dynamics import bias_force, mass_matrix
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.chains import chain_colliders, chain_fixed, chain_links
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
+from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.objective import FALLBACKS, Status
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from tests.bodies import GRAVITY, at, box_inertia, diagonal, down, free_body, on_ground, rises
 from tests.random_trees import FREE, generator, random_inertia, random_links, random_q
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link, homogeneous
-from pbfd_torch.kinematics import Motion, difference, link_jacobians, place, retract
-from pbfd_torch.rotations import quaternion_matrix, skew
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link, homogeneous
+from pbfd_torch.tree.kinematics import Motion, difference, link_jacobians, place, retract
+from pbfd_torch.tree.rotations import quaternion_matrix, skew
 from tests.finite_differences import derivative
 from tests.random_trees import SEEDS, generator, moved_q, random_links, random_q, random_tree
 

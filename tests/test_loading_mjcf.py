@@ -17,8 +17,8 @@ from pbfd_torch.contact.pairing import touch
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Sphere
 from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
 from pbfd_torch.loading import Robot, load_mjcf, load_robot
-from pbfd_torch.rotations import quaternion_matrix
 from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 JOINTS = Path(__file__).parent / "data" / "joints.xml"
 BODY = "<body name='b'><joint name='j'/><geom name='g' size='1'/></body>"

@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from pbfd_torch.articulation import JointKind
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Sphere
 from pbfd_torch.errors import ModelError, NotModelledWarning
-from pbfd_torch.kinematics import place
 from pbfd_torch.loading import Robot, load_robot
-from pbfd_torch.rotations import quaternion_matrix
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import JointDamping
+from pbfd_torch.tree.articulation import JointKind
+from pbfd_torch.tree.kinematics import place
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 ARM = Path(__file__).parent / "data" / "arm_description" / "arm.urdf"
 LIMIT = '<limit lower="-9" upper="9"/>'

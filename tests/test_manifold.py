@@ -20,7 +20,7 @@ from pbfd_torch.contact.polytope import PolytopeTable, polytope_of
 from pbfd_torch.contact.separation import Separation, box_separation, fcl_geometries, fcl_separation
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix
+from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix
 
 F64 = torch.float64
 RANDOM = np.random.default_rng(0)

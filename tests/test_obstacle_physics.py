@@ -17,7 +17,7 @@ from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylind
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact

@@ -11,13 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.assembly import Balance
+from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.contact.motion import Conveyor, Lift, Motion, Still, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Point, Shape, Solid, Sphere
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import place, retract
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact, PreparedContact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -25,7 +24,8 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import StepContext
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.kinematics import place, retract
+from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import generator
 from tests.states import state_of

@@ -9,15 +9,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.bench.starts import scattered
-from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models import SCENES
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.solvers.directions import Newton
 from pbfd_torch.solvers.searches import Foreseen, FullStep, Trial
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
+from pbfd_torch.tree.kinematics import Motion, place
 from tests.random_trees import SEEDS
 from tests.solver_problems import FunctionObjective
 from tests.states import implicit

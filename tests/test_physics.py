@@ -12,17 +12,14 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.balance.dynamics import bias_force, center_of_mass, mass_matrix
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
-from pbfd_torch.dynamics import bias_force, center_of_mass, mass_matrix
-from pbfd_torch.kinematics import place
 from pbfd_torch.models.boxes import box_slide, box_slope
 from pbfd_torch.models.chains import chain_free, chain_ground, chain_heavy, chain_slope, chain_slope_drop
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import quaternion_matrix, rotation_log
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -34,6 +31,9 @@ from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import place
+from pbfd_torch.tree.rotations import quaternion_matrix, rotation_log
 from tests.bodies import GRAVITY, at, box_inertia, diagonal, down, free_body, on_ground, on_world, rises, rolled_out
 from tests.random_trees import generator, random_inertia
 from tests.states import implicit

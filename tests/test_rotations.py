@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.rotations import (
+from pbfd_torch.tree.rotations import (
     log_jacobian_left,
     log_jacobian_symmetric,
     quaternion_conjugate,

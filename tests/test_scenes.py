@@ -15,19 +15,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import pseudo_inertia
+from pbfd_torch.balance.dynamics import center_of_mass, kinetic_energy, momentum
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Point, Sphere
-from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Motion, Placement, place
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES, Setup, file_setup, robot_setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.tree.articulation import pseudo_inertia
+from pbfd_torch.tree.kinematics import Motion, Placement, place
 from tests.gymnasium_files import gymnasium_file
 
 ROOT = Path(__file__).parent.parent

@@ -8,17 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.asynchronous import AsynchronousRollout
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import SCENES
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.schedules.asynchronous import AsynchronousRollout
+from pbfd_torch.schedules.workers import Workers
 from pbfd_torch.solvers import lock_step
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, lbfgs
 from pbfd_torch.solvers.objective import Status
-from pbfd_torch.workers import Workers
 from tests.random_trees import generator
 from tests.states import implicit, state_of
 
@@ -90,7 +90,7 @@ def test_policy_sees_each_world_at_its_own_step() -> None:
 def test_one_call_evaluates_every_world_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds of different difficulty: after some calls they are at different steps, no world has waited for another one, and the
     number of calls is the largest number of evaluations that one world needed."""
-    monkeypatch.setattr("pbfd_torch.asynchronous.FEWEST_LANES", 10**9)
+    monkeypatch.setattr("pbfd_torch.schedules.asynchronous.FEWEST_LANES", 10**9)
     setup = SCENES["box-slide"](worlds=5)
     simulator = implicit(setup.scene, 0.05)
     state = simulator.initial_state(setup.q, setup.v)

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.errors import InputError
-from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.models import SCENES
 from pbfd_torch.optimize import Bounds, Controls, Limits, Shooting, StartVelocity, Stopping
 from pbfd_torch.optimize.tasks import BoxThrow, Hopper
@@ -21,7 +21,7 @@ from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
-from pbfd_torch.trajectory import Trajectory
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 DT, STEPS, WORLDS, MASS = 0.1, 6, 3, 2.0
 

@@ -19,7 +19,7 @@ from pbfd_torch import Articulation, InputError, Joint, JointKind, Link, ModelEr
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Sphere
 from pbfd_torch.models.chains import chain_fixed, chain_ground, chain_slope_drop
-from pbfd_torch.rollout import FORMAT
+from pbfd_torch.records.rollout import FORMAT
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction

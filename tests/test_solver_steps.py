@@ -12,13 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective, EnergyObjective
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.kinematics import place
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import STIFFNESS, chain_colliders, chain_ground, chain_links
 from pbfd_torch.models.setup import tilted
-from pbfd_torch.objective import BalanceObjective, EnergyObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
@@ -28,6 +26,8 @@ from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 from tests.random_trees import generator
 from tests.solver_problems import METHODS, ROOT_METHODS, changed
 from tests.states import implicit

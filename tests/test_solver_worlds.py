@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from pbfd_torch.integrators.implicit_euler import Positions
-from pbfd_torch.kinematics import retract
 from pbfd_torch.models.boxes import box_slide
 from pbfd_torch.models.chains import chain_fixed, chain_ground
 from pbfd_torch.models.setup import Setup
@@ -24,6 +23,7 @@ from pbfd_torch.solvers.named import jtj_lm, lbfgs, lm
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.tree.kinematics import retract
 from tests.random_trees import generator
 from tests.states import implicit, state_of
 

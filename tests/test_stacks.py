@@ -13,14 +13,14 @@ from torch import Tensor
 from pbfd_torch.contact.shapes import Box, Capsule, Sphere
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import HALF, arch, heavy_on_light, stack, stack_10
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import quaternion_exp
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.rotations import quaternion_exp
 from tests.bodies import GRAVITY, rises, rolled_out
 from tests.touching_bodies import SLIP_SPEED, STIFFNESS, free_bodies, posed, stored
 

@@ -19,7 +19,7 @@ from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSu
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Point, Solid, Sphere
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 from tests.finite_differences import derivative
 
 Array = NDArray[np.float64]

@@ -10,15 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link, homogeneous
-from pbfd_torch.assembly import Balance
+from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import place, retract
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact, ContactPoints
 from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor, slip_factor_slope
@@ -31,6 +28,9 @@ from pbfd_torch.terms.load import LinkLoad, Term
 from pbfd_torch.terms.normal_force import NormalForce, power
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.pushes import Pushes
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link, homogeneous
+from pbfd_torch.tree.kinematics import place, retract
+from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
 from tests.finite_differences import derivative, jacobian, relative_error
 from tests.random_trees import SEEDS
 from tests.states import state_of

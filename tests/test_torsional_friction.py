@@ -7,20 +7,20 @@ import dataclasses
 import pytest
 import torch
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance
+from pbfd_torch.balance.assembly import Balance
+from pbfd_torch.balance.objective import EnergyObjective
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Point, Sphere
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import place
-from pbfd_torch.objective import EnergyObjective
 from pbfd_torch.scene import Scene
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.torsional_friction import TorsionalFriction
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 from tests.bodies import GRAVITY, at, diagonal, down, free_body, rolled_out
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import SEEDS

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.hazards import Hazard
 from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.polytope import thickness_of
 from pbfd_torch.contact.primitives import BoxSurface
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Shape, Sphere
 from pbfd_torch.contact.surface import Tangent
-from pbfd_torch.hazards import Hazard
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact_terms import contact_terms
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.tree.articulation import Articulation
 from tests.bodies import rolled_out
 from tests.finite_differences import derivative, relative_error
 from tests.random_trees import generator

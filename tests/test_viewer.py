@@ -18,11 +18,11 @@ import torch
 
 from pbfd_torch import InputError, Rollout, Simulator, Status
 from pbfd_torch.contact.motion import Turntable
-from pbfd_torch.depiction import depicted
 from pbfd_torch.loading import load_robot
 from pbfd_torch.loading.scene import robot_scene
 from pbfd_torch.models import SCENES, file_setup
-from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.records.depiction import depicted
+from pbfd_torch.tree.rotations import quaternion_matrix
 from pbfd_torch.viewer import Inspector
 from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.export import frames_shown, save_html, save_png
@@ -398,7 +398,7 @@ def test_hostile_files_are_refused(rollout: Rollout, tmp_path: Path, monkeypatch
     with pytest.raises(InputError, match="single array"):
         Rollout.load(tmp_path / "single.npy")
     rollout.save(path)
-    monkeypatch.setattr("pbfd_torch.rollout.LARGEST", 1000)
+    monkeypatch.setattr("pbfd_torch.records.rollout.LARGEST", 1000)
     with pytest.raises(InputError, match="claims"):
         Rollout.load(path)
 

@@ -12,9 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.surface import Plane
-from pbfd_torch.kinematics import place
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -27,7 +26,8 @@ from pbfd_torch.terms.load import JointLoad, LinkLoad, Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.pushes import Pushes
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 from tests.random_trees import generator, random_q, random_tree
 from tests.term_cases import TERMS, Situation, TermCase, actuators, coefficients, contact, dry_torque, pushes, situation
 

@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.models.stacks import solid_box
-from pbfd_torch.rollout import Rollout
-from pbfd_torch.rotations import quaternion_exp
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.rotations import quaternion_exp
 from tests.bodies import down
 
 STIFFNESS = 1e8  # C⊥ [N/m²]

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.bench.hard_cases_case import (
     BEST,
     CONSERVING,
@@ -26,12 +25,13 @@ from pbfd_torch.models.chains import chain_fixed, chain_free
 from pbfd_torch.models.chains import chain_heavy as chain_heavy_setup
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.stacks import solid_box
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 LEG = 0.2  # length of a thigh and of a shank [m]
 TORQUE = 0.5  # standard deviation of the joint torques [N m]

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import torch
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.bench.hard_cases_case import ALL, BEST, FIRST_ORDER, ONE_STEP, TIME_STEPS, Case, Check, Run, most, rise
 from pbfd_torch.bench.hard_cases_scenes import GRAVITY, body, coulomb, down, on_plane, placed, row, sunk
 from pbfd_torch.contact.half_space import HalfSpace
@@ -19,6 +18,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 HALF = (0.1, 0.1, 0.05)  # half extents [m]
 DROP = 0.5  # [m]

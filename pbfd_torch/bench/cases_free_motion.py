@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from scipy.special import ellipj, ellipk
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.balance.dynamics import center_of_mass
 from pbfd_torch.bench.hard_cases_case import (
     ALL,
     BEST,
@@ -25,15 +25,15 @@ from pbfd_torch.bench.hard_cases_case import (
     rise,
 )
 from pbfd_torch.bench.hard_cases_scenes import GRAVITY, body, down, placed, row, weightless
-from pbfd_torch.dynamics import center_of_mass
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import place
 from pbfd_torch.models.spinning import dzhanibekov as dzhanibekov_setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import place
 
 TUMBLING = (0.1, 0.2, 0.3)  # half extents [m]
 ARM, MASS, MOMENT = 0.4, 1.5, 0.02  # pendulum: arm [m], mass [kg], moment about the centre of mass [kg m²]

@@ -23,8 +23,8 @@ from pbfd_torch.bench.hard_cases_scenes import (
     sunk,
 )
 from pbfd_torch.contact.shapes import Sphere
-from pbfd_torch.kinematics import difference
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
+from pbfd_torch.tree.kinematics import difference
 
 MU = (0.1, 0.3, 0.5, 0.7, 1.0)
 SLOPES = (3.0, 10.0, 20.0, 30.0, 40.0)  # [°]

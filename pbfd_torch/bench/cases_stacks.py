@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import torch
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.bench.hard_cases_case import TIME_STEPS, Case, Check, Run, most
 from pbfd_torch.bench.hard_cases_scenes import GRAVITY, STIFFNESS, coulomb, down, row
 from pbfd_torch.contact.half_space import HalfSpace
@@ -18,6 +17,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation
 
 RADIUS = 0.1  # [m]
 

@@ -23,7 +23,6 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider
@@ -38,6 +37,7 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 GRAVITY = 9.81
 MASS = 1.0  # [kg]

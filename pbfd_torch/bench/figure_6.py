@@ -15,13 +15,12 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy
 from pbfd_torch.bench import figure_6_peers, mujoco_runs
 from pbfd_torch.bench.timing import Progress, timed
 from pbfd_torch.conventional.newton_euler import NewtonEuler
-from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.kinematics import Motion, place
 from pbfd_torch.models import chains
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
@@ -31,6 +30,7 @@ from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
+from pbfd_torch.tree.kinematics import Motion, place
 
 Row = dict[str, Any]
 

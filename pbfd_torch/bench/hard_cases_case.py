@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 

@@ -7,17 +7,17 @@ import math
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider, Shape
 from pbfd_torch.models.stacks import solid_box
-from pbfd_torch.rotations import quaternion_exp
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.rotations import quaternion_exp
 
 GRAVITY = 9.81
 SLIP_SPEED = 1e-3  # ε_v of Coulomb's law [m/s]

@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.adaptive import AdaptiveSimulator
 from pbfd_torch.bench import mujoco_runs
 from pbfd_torch.bench.precision_scenes import CASES, FRAME, Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.schedules.adaptive import AdaptiveSimulator
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 

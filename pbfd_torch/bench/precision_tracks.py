@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy, rotor_energy
-from pbfd_torch.kinematics import Motion, place
+from pbfd_torch.balance.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy, rotor_energy
 from pbfd_torch.models import Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.tree.kinematics import Motion, place
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import place, retract
 from pbfd_torch.models import Setup
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.tree.kinematics import place, retract
 
 
 def _depth(setup: Setup, q: Tensor) -> Tensor:

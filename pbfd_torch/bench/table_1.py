@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective, EnergyObjective
 from pbfd_torch.bench.timing import Progress, exponent, fit_sizes, timed, worst
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models.chains import GRAVITY, RADIUS, STIFFNESS, chain_colliders, chain_links
-from pbfd_torch.objective import BalanceObjective, EnergyObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.directions import Direction, GaussNewtonLm, JtjLm, Lm, Model, Newton, times
@@ -27,6 +26,7 @@ from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.articulation import Articulation
 
 DT = 0.01  # [s]
 DAMPING = 1e-3

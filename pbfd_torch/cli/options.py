@@ -12,11 +12,11 @@ from typing import Any
 
 import torch
 
-from pbfd_torch.adaptive import AdaptiveSimulator
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES, Setup, file_setup
 from pbfd_torch.scene import Scene
+from pbfd_torch.schedules.adaptive import AdaptiveSimulator
 from pbfd_torch.simulator import Simulator, Solver
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks

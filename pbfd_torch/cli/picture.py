@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.models import Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 
 Frame = NDArray[np.float64]
 

@@ -16,14 +16,14 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.asynchronous import AsynchronousRollout
 from pbfd_torch.cli.options import Choices, Schedule, with_friction
+from pbfd_torch.contact.hazards import Hazard
 from pbfd_torch.errors import InputError
-from pbfd_torch.hazards import Hazard
 from pbfd_torch.models import Setup
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.schedules.asynchronous import AsynchronousRollout
+from pbfd_torch.schedules.workers import Workers
 from pbfd_torch.solvers.objective import Status
-from pbfd_torch.workers import Workers
 
 MAX_STEPS = 10_000_000
 FRAME = 0.05  # [s] of the records where worlds choose their own steps

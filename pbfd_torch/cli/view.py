@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from pbfd_torch.cli.options import Choices, Integrator, load_setup, use_threads
 from pbfd_torch.errors import InputError
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 
 if TYPE_CHECKING:
     from pbfd_torch.viewer import Inspector, Live

@@ -10,7 +10,7 @@ from torch import Tensor
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.primitives import BoxSurface
 from pbfd_torch.contact.surface import Placed, Tangent
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.worlds import replaced
 
 
 @dataclass(frozen=True, eq=False)

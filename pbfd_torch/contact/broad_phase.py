@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.plain import plain
+from pbfd_torch.tensors.plain import plain
 
 _ROUNDING = 1e-14  # of a corner's coordinates: FCL's own boxes are no smaller than ours
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.surface import Surface
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.worlds import replaced
 
 
 @dataclass(frozen=True, eq=False)

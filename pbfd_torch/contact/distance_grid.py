@@ -15,7 +15,7 @@ from torch import Tensor
 from pbfd_torch.contact.splines import coefficients_through, evaluate
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,9 +10,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import homogeneous
 from pbfd_torch.errors import InputError
-from pbfd_torch.rotations import quaternion_exp, quaternion_matrix
+from pbfd_torch.tree.articulation import homogeneous
+from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix
 
 Vector = tuple[float, float, float]
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import homogeneous
 from pbfd_torch.contact.motion import Motion, Still
 from pbfd_torch.contact.pairing import Touchable
 from pbfd_torch.contact.polytope import thickness_of
 from pbfd_torch.contact.shapes import Nearby, Shape, Solid
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
-from pbfd_torch.rotations import quaternion_matrix
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import homogeneous
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 
 @dataclass(frozen=True, eq=False)

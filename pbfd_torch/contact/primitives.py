@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
 
 _NEGLIGIBLE = 1e-15  # shorter vectors [m] have no direction; its square and that of its inverse fit into float32
 

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
-from pbfd_torch.plain import plain
+from pbfd_torch.tensors.plain import plain
 
 _DEEPER = 0.05  # a face is taken where its depth is at most this share larger than the smallest …
 _SLACK = 1e-4  # … or its separation at most this share of the smaller body's size less than the largest

@@ -10,7 +10,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
 class Field:

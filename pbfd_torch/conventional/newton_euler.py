@@ -18,15 +18,15 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.dynamics import bias_force, mass_matrix
 from pbfd_torch.conventional.complementarity import FrictionProblem, Impulses, solve
 from pbfd_torch.conventional.constraints import Constraints, contact_constraints, dry_friction_constraints, limit_constraints
 from pbfd_torch.conventional.recording import Recorder, Touched
-from pbfd_torch.dynamics import bias_force, mass_matrix
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import place, retract
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction
 from pbfd_torch.terms.inertia import Inertia
@@ -34,7 +34,7 @@ from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import JointLoad, StepContext, Term
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import place, retract
 
 ROUNDING = 32.0  # rounding errors of a velocity that a solution may hold, in units of its last place
 

@@ -8,14 +8,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.dynamics import potential_energy
-from pbfd_torch.kinematics import Motion, Placement, place
-from pbfd_torch.recording import Records
+from pbfd_torch.balance.dynamics import potential_energy
+from pbfd_torch.records.recording import Records
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.load import Conservative
+from pbfd_torch.tree.kinematics import Motion, Placement, place
 
 
 @dataclass(frozen=True, eq=False)

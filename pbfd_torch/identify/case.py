@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.parameters import parameters, with_parameters
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.scene import Scene
 
 

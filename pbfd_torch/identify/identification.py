@@ -15,13 +15,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.identify.case import Case
 from pbfd_torch.identify.certainty import Certainty, certainty
 from pbfd_torch.identify.columns import linearized
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Fit, Stopping, levenberg_marquardt
 from pbfd_torch.identify.measurements import Measurement
 from pbfd_torch.identify.unknowns import Quantity, Unknown
-from pbfd_torch.implicit import Doubtful, Gradients
 from pbfd_torch.integrators.integrator import Integrator, State
 from pbfd_torch.simulator import Simulator
 

@@ -9,9 +9,9 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import difference, place
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import difference, place
 
 
 class Measurement(Protocol):

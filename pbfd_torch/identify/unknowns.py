@@ -17,8 +17,8 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.identify.case import Case
 from pbfd_torch.identify.levenberg_marquardt import Bounds
-from pbfd_torch.inertial import COM, LOG_MASS, NAMES, SPREAD, log_cholesky, mass_com_inertia, pseudo_inertia_of
-from pbfd_torch.kinematics import retract
+from pbfd_torch.tree.inertial import COM, LOG_MASS, NAMES, SPREAD, log_cholesky, mass_com_inertia, pseudo_inertia_of
+from pbfd_torch.tree.kinematics import retract
 
 INERTIA = "articulation.pseudo_inertia"
 MOMENTS = ((0, 0, "xx"), (1, 1, "yy"), (2, 2, "zz"), (0, 1, "xy"), (1, 2, "yz"), (0, 2, "xz"))

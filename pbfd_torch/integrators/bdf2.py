@@ -9,13 +9,13 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, fresh
-from pbfd_torch.kinematics import Motion, difference, place, retract
-from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Motion, difference, place, retract
 
 Past = tuple[Tensor, Tensor, Tensor]
 

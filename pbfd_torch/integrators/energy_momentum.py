@@ -21,9 +21,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance
-from pbfd_torch.dynamics import (
+from pbfd_torch.balance.assembly import Balance
+from pbfd_torch.balance.dynamics import (
     armature_diagonal,
     generalised_momentum,
     kinetic_energy,
@@ -31,15 +30,16 @@ from pbfd_torch.dynamics import (
     potential_energy,
     rotor_energy,
 )
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, calm, fall, fresh
-from pbfd_torch.kinematics import Chord, Motion, Placement, difference, place, retract
-from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import Load, StepContext, Term
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Chord, Motion, Placement, difference, place, retract
 
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step

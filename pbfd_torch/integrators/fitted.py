@@ -9,11 +9,11 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.dynamics import mass_matrix
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.balance.dynamics import mass_matrix
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.load import JointLoad, StepContext, Term
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Placement
 
 
 @runtime_checkable

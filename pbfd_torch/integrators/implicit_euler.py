@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, calm, fresh
-from pbfd_torch.kinematics import difference, place, retract
-from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import difference, place, retract
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from typing_extensions import TypeVar
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.dynamics import kinetic_energy
-from pbfd_torch.kinematics import Motion, Placement
-from pbfd_torch.objective import BalanceObjective
+from pbfd_torch.balance.dynamics import kinetic_energy
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.load import StepContext, Term
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Motion, Placement
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

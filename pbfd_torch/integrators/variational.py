@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.terms.load import StepContext
+from pbfd_torch.tree.articulation import Articulation
 
 BLENDS = (0.25, 0.5, 0.75)
 

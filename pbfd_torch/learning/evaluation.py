@@ -17,7 +17,7 @@ from pbfd_torch.learning.networks import make_actor, mean_action
 from pbfd_torch.learning.track import tracked
 from pbfd_torch.learning.training_env import EnvSettings, location_and_scale
 from pbfd_torch.learning.worlds import trial_worlds
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 
 SHOWN = 4  # worlds in a saved rollout
 

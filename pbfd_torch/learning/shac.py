@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.learning import curve
 from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import SEEN, make_actor, make_critic

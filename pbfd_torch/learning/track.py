@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Motion, place
-from pbfd_torch.recording import Records
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.recording import Records
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
+from pbfd_torch.tree.kinematics import Motion, place
 
 
 class _Track(Records):

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import torch
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider, ConvexHull, Shape, Solid
-from pbfd_torch.kinematics import place
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 
 OVERLAP = 1e-3  # [m] from which on shapes overlap: no deeper than a contact gives way under the robot's weight (`robot_scene`)
 

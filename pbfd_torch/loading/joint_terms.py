@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Link
-from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.balance.dynamics import mass_matrix
 from pbfd_torch.errors import ModelError
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings, checked_coefficient
 from pbfd_torch.terms.load import Term
+from pbfd_torch.tree.articulation import Articulation, Link
 
 _SMALLEST = 1e-14  # inertia of a joint, relative to the robot's largest, that is a rounding error of zero
 

@@ -10,9 +10,7 @@ from typing import Any
 
 import torch
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.errors import ModelError
-from pbfd_torch.kinematics import retract
 from pbfd_torch.loading.joint_terms import JointProperties, articulate
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
@@ -22,6 +20,8 @@ from pbfd_torch.loading.mjcf_visuals import mjcf_visuals
 from pbfd_torch.loading.report import naming, warn_not_modelled
 from pbfd_torch.loading.robot import Keyframe, Robot
 from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
+from pbfd_torch.tree.kinematics import retract
 
 
 def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Robot:

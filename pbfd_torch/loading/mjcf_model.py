@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.report import existing_file
-from pbfd_torch.rotations import quaternion_matrix
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 
 def label(enum: str, value: int) -> str:

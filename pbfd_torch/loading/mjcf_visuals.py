@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from pbfd_torch.appearance import WORLD, Color, Visual
-from pbfd_torch.depiction import STONE, link_color, visual_of
 from pbfd_torch.loading.mjcf_colliders import primitive
 from pbfd_torch.loading.mjcf_model import CompiledModel, compile_mjcf
+from pbfd_torch.looks.appearance import WORLD, Color, Visual
+from pbfd_torch.looks.painting import STONE, link_color, visual_of
 
 _VISIBLE = 3  # groups 0, 1 and 2 are shown by default
 _UNPAINTED = (0.5, 0.5, 0.5, 1.0)  # what a geom has whose file says nothing

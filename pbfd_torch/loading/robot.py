@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 from torch import Tensor
 
-from pbfd_torch.appearance import Visual
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
+from pbfd_torch.looks.appearance import Visual
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.load import Term
+from pbfd_torch.tree.articulation import Articulation
 
 
 @dataclass(frozen=True, eq=False)

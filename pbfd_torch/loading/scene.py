@@ -8,7 +8,6 @@ import torch
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
-from pbfd_torch.kinematics import place
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
@@ -16,6 +15,7 @@ from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.tree.kinematics import place
 
 
 def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace | Obstacle] | None = None, penetration: float = 1e-3) -> Scene:

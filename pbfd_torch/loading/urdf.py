@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pbfd_torch.articulation import Joint, JointKind, Link
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.joint_terms import JointProperties, articulate
 from pbfd_torch.loading.report import listing, naming, warn_not_modelled
@@ -23,6 +22,7 @@ from pbfd_torch.loading.urdf_file import Parsed, UrdfFile, read_urdf
 from pbfd_torch.loading.urdf_placement import Placed, plane_axes, rotation_matrix
 from pbfd_torch.loading.urdf_visuals import urdf_visuals
 from pbfd_torch.terms.actuators import Actuator, Actuators
+from pbfd_torch.tree.articulation import Joint, JointKind, Link
 
 _GRAVITY = (0.0, 0.0, -9.81)  # [m/s²]; URDF has none
 

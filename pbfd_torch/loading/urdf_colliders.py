@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Shape, Sphere
 from pbfd_torch.errors import InputError
@@ -16,6 +15,7 @@ from pbfd_torch.loading.meshes import HullLosses, find_mesh, load_hull
 from pbfd_torch.loading.report import listing, naming
 from pbfd_torch.loading.urdf_file import UrdfFile
 from pbfd_torch.loading.urdf_placement import Placed
+from pbfd_torch.tree.articulation import Articulation
 
 _FLAT = 1e-9  # of the size
 

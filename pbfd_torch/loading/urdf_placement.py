@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pbfd_torch.rotations import quaternion_matrix, quaternion_multiply
+from pbfd_torch.tree.rotations import quaternion_matrix, quaternion_multiply
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

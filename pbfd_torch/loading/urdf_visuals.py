@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from pbfd_torch.appearance import Color, Visual
-from pbfd_torch.depiction import link_color, visual_of
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.meshes import find_mesh, read_mesh
 from pbfd_torch.loading.report import existing_file
 from pbfd_torch.loading.urdf_colliders import primitive
 from pbfd_torch.loading.urdf_file import complaints, root_of
 from pbfd_torch.loading.urdf_placement import Placed
+from pbfd_torch.looks.appearance import Color, Visual
+from pbfd_torch.looks.painting import link_color, visual_of
 
 
 @functools.lru_cache(maxsize=4)

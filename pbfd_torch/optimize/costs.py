@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.linearization import Chart
 from pbfd_torch.integrators.integrator import S, State
-from pbfd_torch.kinematics import difference
-from pbfd_torch.linearization import Chart
 from pbfd_torch.simulator import Simulator
+from pbfd_torch.tree.kinematics import difference
 
 
 @dataclass(frozen=True, eq=False)

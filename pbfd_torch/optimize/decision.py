@@ -12,8 +12,8 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.identify.levenberg_marquardt import Bounds
 from pbfd_torch.integrators.integrator import S, State
 from pbfd_torch.optimize.limits import Limits
-from pbfd_torch.parameters import mapped_tensors
 from pbfd_torch.simulator import Simulator
+from pbfd_torch.tensors.structures import mapped_tensors
 
 C = TypeVar("C", bound=State, covariant=True)
 

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.linearization import Chart
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.linearization import Chart
 from pbfd_torch.optimize.backward_pass import Policy, Regularisation, backward_pass
 from pbfd_torch.optimize.costs import Cost, expanded
 from pbfd_torch.optimize.limits import Limits
-from pbfd_torch.parameters import mapped_tensors
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import is_solved
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.tensors.structures import mapped_tensors
 
 LONG = 1  # the last of the lengths that are not yet short
 

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.identify.levenberg_marquardt import Stopping, levenberg_marquardt
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.optimize.decision import Decision, Plan
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.trajectory import Trajectory
 
 OfTrajectory = Callable[[Trajectory[S], Tensor | None], Tensor]
 """A differentiable function of a trajectory and its controls `[T, *batch, nu]`, each world by itself."""

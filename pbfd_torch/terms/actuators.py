@@ -11,12 +11,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, JointKind
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation, JointKind
+from pbfd_torch.tree.kinematics import Placement
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.checks import require_positive, require_widening
 from pbfd_torch.terms.coulomb_friction import DryFriction
 from pbfd_torch.terms.friction_law import slip_size
-from pbfd_torch.worlds import replaced
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,11 +20,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.candidates import Finder, Slots
+from pbfd_torch.contact.hazards import Hazard, Overflow
 from pbfd_torch.contact.obstacle import Carrier
 from pbfd_torch.errors import ContactOverflowError
-from pbfd_torch.hazards import Hazard, Overflow
-from pbfd_torch.kinematics import Motion, Placement
-from pbfd_torch.rotations import rotation_log, skew
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.checks import require_non_negative, require_positive
 from pbfd_torch.terms.contact import ContactPoints
@@ -35,7 +34,8 @@ from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.touching import ContactForce, Touching, extended, mapped, outer
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import Motion, Placement
+from pbfd_torch.tree.rotations import rotation_log, skew
 
 _FAR = 1e6  # [m] how far an empty slot is from everything
 

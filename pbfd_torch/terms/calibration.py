@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
-from pbfd_torch.worlds import replaced
 
 ROUNDS = 60  # of Newton's method on convex functions from their outer side; it halves the error at a double root, else squares it
 

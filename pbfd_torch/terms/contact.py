@@ -17,14 +17,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Carrier, Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.contact.surface import Surface, Tangent
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Motion, Placement
-from pbfd_torch.rotations import quaternion_matrix, rotation_log
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact_outlook import contact_outlook
 from pbfd_torch.terms.friction_law import FrictionLaw
@@ -35,7 +33,9 @@ from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.touching import ContactForce, Touching, arm, cross, extended, mapped, turned
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Motion, Placement
+from pbfd_torch.tree.rotations import quaternion_matrix, rotation_log
 
 
 @dataclass(frozen=True, eq=False)

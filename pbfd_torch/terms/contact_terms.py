@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, homogeneous
 from pbfd_torch.contact.ball_box_pairs import BallBoxPairs
 from pbfd_torch.contact.candidates import Finder
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.hazards import Overflow
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.pairing import friction_between, touch
 from pbfd_torch.contact.polytope import polytope_of
@@ -27,8 +27,6 @@ from pbfd_torch.contact.polytope_pairs import POINTS, PolytopePairs
 from pbfd_torch.contact.round_pairs import Round, RoundPairs
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
-from pbfd_torch.hazards import Overflow
-from pbfd_torch.rotations import quaternion_matrix
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -36,6 +34,8 @@ from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
 from pbfd_torch.terms.restitution import Restitution
+from pbfd_torch.tree.articulation import Articulation, homogeneous
+from pbfd_torch.tree.rotations import quaternion_matrix
 
 SLOTS = 128
 

@@ -9,9 +9,9 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.friction_law import per_size, slip_size
-from pbfd_torch.worlds import Worlds, replaced
 
 
 def slip_factor(size: Tensor, width: Tensor) -> Tensor:

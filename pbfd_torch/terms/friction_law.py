@@ -7,7 +7,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 
 
 class FrictionLaw(Protocol):

@@ -14,10 +14,10 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Chord, Placement
-from pbfd_torch.rotations import skew
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.load import ChordLoad, LinkLoad, StepContext
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.kinematics import Chord, Placement
+from pbfd_torch.tree.rotations import skew
 
 
 @dataclass(frozen=True, eq=False)

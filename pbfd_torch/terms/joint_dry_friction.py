@@ -7,11 +7,11 @@ from typing import Self
 
 from torch import Tensor
 
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import Placement
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,13 @@ from typing import Self
 
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, force_scale, lever
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.release import NormalLaw, require_release
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation, force_scale, lever
+from pbfd_torch.tree.kinematics import Placement
 
 _LAW = NormalForce(1.0, exponent=2.0)
 

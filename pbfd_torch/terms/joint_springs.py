@@ -8,13 +8,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement, difference, retract
-from pbfd_torch.rotations import log_jacobian_symmetric
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Placement, difference, retract
+from pbfd_torch.tree.rotations import log_jacobian_symmetric
 
 
 def checked_coefficient(articulation: Articulation, value: Tensor, what: str) -> Tensor:

@@ -8,8 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.friction_law import FrictionLaw, SlipLaw
-from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import Chord, Motion, Placement, place
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.tree.kinematics import Chord, Motion, Placement, place
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,11 +9,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.release import NormalLaw, Releasing, require_release
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
 
 
 def power(base: Tensor, exponent: float) -> Tensor:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.friction_law import per_size, slip_size
 from pbfd_torch.terms.normal_force import power
-from pbfd_torch.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)

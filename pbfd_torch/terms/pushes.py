@@ -8,11 +8,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.load import LinkLoad, StepContext
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Placement
 
 
 @dataclass(frozen=True, eq=False)

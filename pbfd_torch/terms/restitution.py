@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.worlds import replaced
 
 _HARDER = 300.0  # how many times less deep a contact gets that throws back; what it gives way is lost to the rebound
 

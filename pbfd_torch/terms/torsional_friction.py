@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement
-from pbfd_torch.rotations import log_jacobian_left, skew
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.contact import Contact, PreparedContact
 from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
 from pbfd_torch.terms.grouping import Grouping
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.touching import Touching, outer, rows, shifting
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import Placement
+from pbfd_torch.tree.rotations import log_jacobian_left, skew
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.rotations import log_jacobian_left, skew
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
+from pbfd_torch.tree.rotations import log_jacobian_left, skew
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from pbfd_torch.appearance import Color, Visual
+from pbfd_torch.looks.appearance import Color, Visual
 from pbfd_torch.viewer.film import Array, Film, quaternions
 
 

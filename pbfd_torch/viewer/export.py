@@ -18,7 +18,7 @@ import viser
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.browser import page
 from pbfd_torch.viewer.film import Film

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.appearance import WORLD, Appearance
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.looks.appearance import WORLD, Appearance
+from pbfd_torch.records.rollout import Rollout
 
 Array = NDArray[np.float32]
 SLIDING = 1e-3  # [m/s] of slip from which on a contact counts as sliding

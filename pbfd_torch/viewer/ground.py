@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
-from pbfd_torch.appearance import Plane
+from pbfd_torch.looks.appearance import Plane
 from pbfd_torch.viewer.film import Array, Film, quaternions
 
 _CELLS = 4  # per body size, about

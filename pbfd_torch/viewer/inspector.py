@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.film import Film
 from pbfd_torch.viewer.layout import MOST

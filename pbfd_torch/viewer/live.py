@@ -12,13 +12,13 @@ import torch
 import viser
 from torch import Tensor
 
-from pbfd_torch.dynamics import mass_matrix
+from pbfd_torch.balance.dynamics import mass_matrix
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.parameters import parameters, with_parameters
-from pbfd_torch.recording import Recorder
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.recording import Recorder
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Status

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pbfd_torch.appearance import JointMark
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.looks.appearance import JointMark
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.solvers.objective import FALLBACKS
 from pbfd_torch.viewer.film import Film
 

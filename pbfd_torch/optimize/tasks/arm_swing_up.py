@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.errors import InputError
-from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.optimize.costs import Cost, Weights, quadratic
 from pbfd_torch.optimize.decision import Plan
@@ -24,6 +23,7 @@ from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import JointDamping
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 LENGTH, MASS = 0.5, 1.0  # of a link [m], [kg]
 EFFORT = (8.0, 4.0)  # [N m]; the shoulder would need 9.8 N m to hold the arm level

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Sphere
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Stopping
-from pbfd_torch.implicit import Doubtful, Gradients
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.optimize.decision import StartVelocity
 from pbfd_torch.optimize.shooting import Progress, Shooting
@@ -23,7 +23,7 @@ from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.trajectory import Trajectory
+from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 HALF = (0.1, 0.1, 0.05)  # half extents [m]
 RADIUS = 0.01  # of the sphere at each corner [m]

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.implicit import Doubtful, Gradients
+from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.models.robots import hopper
 from pbfd_torch.optimize.decision import Controls
@@ -16,7 +17,6 @@ from pbfd_torch.optimize.limits import Limits
 from pbfd_torch.optimize.shooting import Progress, Shooting
 from pbfd_torch.optimize.tasks.task import Outcome
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.trajectory import Trajectory
 
 HIGH = 1.4  # where the torso is to be at the end [m]; with straight joints it stands at 1.25 m
 NEAR, UPRIGHT = 0.03, 0.3  # [m], [rad] at the end

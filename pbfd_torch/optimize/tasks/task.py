@@ -10,7 +10,7 @@ from torch import Tensor
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.optimize.decision import Plan
 from pbfd_torch.optimize.shooting import Progress
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 
 

@@ -9,9 +9,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.structures import Constant
+
 
 @dataclass(frozen=True, eq=False)
-class Topology:
+class Topology(Constant):
     """Nodes are joints, node 0 is the world, node j + 1 is joint j; parents come first. All index tensors are on `device`."""
 
     link_names: tuple[str, ...]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
-from pbfd_torch.appearance import Appearance, Color, JointMark, Plane, Visual
-from pbfd_torch.articulation import JointKind
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Point
 from pbfd_torch.errors import PbfdError
-from pbfd_torch.kinematics import place
-from pbfd_torch.rotations import quaternion_matrix
-from pbfd_torch.tessellation import tessellated
+from pbfd_torch.looks.appearance import Appearance, JointMark, Plane, Visual
+from pbfd_torch.looks.painting import STONE, link_color, surface_of, visual_of
+from pbfd_torch.looks.tessellation import tessellated
+from pbfd_torch.scene import Scene
+from pbfd_torch.tree.articulation import JointKind
+from pbfd_torch.tree.kinematics import place
 
-if TYPE_CHECKING:
-    from pbfd_torch.scene import Scene
-
-_TONES: tuple[Color, ...] = ((0.10, 0.33, 0.60), (0.93, 0.52, 0.12))  # of links in turn, so that neighbours differ
-STONE: Color = (0.62, 0.62, 0.6)
 _THIN = 1e-3  # [m] half extents that a body without thickness is drawn with
 
 
@@ -58,34 +53,11 @@ def _depicted(scene: Scene) -> Appearance:
         if isinstance(obstacle, HalfSpace):
             planes.append(Plane(obstacle.name, k, obstacle.normal, obstacle.offset))
         elif obstacle.name not in painted:  # a link fixed to the world, which has visuals
-            visuals.append(_visual(obstacle.name, k, tessellated(obstacle.shape), color=STONE))
+            visuals.append(surface_of(obstacle.name, k, tessellated(obstacle.shape), color=STONE))
     gravity = scene.gravity.detach().reshape(-1, 3)[0].double()
     strength = float(torch.linalg.vector_norm(gravity))
     up = (0.0 - gravity / strength).tolist() if strength > 0 else (0.0, 0.0, 1.0)
     return Appearance(tuple(visuals), tuple(planes), tuple(_joint_marks(scene)), tuple(up))
-
-
-def link_color(link: int) -> Color:
-    """The colour of a link that has none of its own."""
-    return _TONES[link % len(_TONES)]
-
-
-def visual_of(name: str, body: int, shape: Any, position: Sequence[float], quaternion: Sequence[float], color: Color) -> Visual:
-    """A shape of `contact.shapes` at a place in its body's frame."""
-    return _visual(name, body, tessellated(shape), position, quaternion, color)
-
-
-def _visual(
-    name: str,
-    body: int,
-    mesh: Any,
-    position: Sequence[float] = (0.0, 0.0, 0.0),
-    quaternion: Sequence[float] = (1.0, 0.0, 0.0, 0.0),
-    color: Color = STONE,
-) -> Visual:
-    turn = quaternion_matrix(torch.nn.functional.normalize(torch.tensor(quaternion, dtype=torch.float64), dim=0)).numpy()
-    vertices = np.asarray(mesh.vertices, np.float64) @ turn.T + np.asarray(position, np.float64)
-    return Visual(name, body, vertices.astype(np.float32), np.asarray(mesh.faces, np.int32), color)
 
 
 def _worn(colliders: Iterable[Collider], link: int) -> list[Visual]:
@@ -101,7 +73,7 @@ def _skin(points: Sequence[Collider], link: int) -> list[Visual]:
     if not thick:
         return []
     balls = [trimesh.creation.icosphere(subdivisions=2, radius=x.margin).vertices + np.array(x.position) for x in thick]
-    return [_visual("skin", link, trimesh.convex.convex_hull(np.concatenate(balls)), color=link_color(link))]
+    return [surface_of("skin", link, trimesh.convex.convex_hull(np.concatenate(balls)), color=link_color(link))]
 
 
 def _inertia_box(scene: Scene, link: int) -> list[Visual]:
@@ -119,7 +91,7 @@ def _inertia_box(scene: Scene, link: int) -> list[Visual]:
     turn = (axes * torch.linalg.det(axes)).numpy()
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = turn, com.numpy()
-    return [_visual("inertia", link, trimesh.creation.box(2 * half, transform=place), color=link_color(link))]
+    return [surface_of("inertia", link, trimesh.creation.box(2 * half, transform=place), color=link_color(link))]
 
 
 def _joint_marks(scene: Scene) -> Iterable[JointMark]:

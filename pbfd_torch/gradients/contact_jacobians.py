@@ -8,11 +8,11 @@ from typing import Any
 from torch import Tensor
 
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.kinematics import link_jacobians
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact, ContactPoints
 from pbfd_torch.terms.touching import shifting
+from pbfd_torch.tree.kinematics import link_jacobians
 
 
 @dataclass(frozen=True, eq=False)

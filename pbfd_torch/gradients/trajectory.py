@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.linked import Linked, Made, Play, carries, doubts_of
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.linked import Linked, Made, Play, carries, doubts_of
-from pbfd_torch.parameters import tensors_of
 from pbfd_torch.solvers.objective import is_solved
+from pbfd_torch.tensors.structures import tensors_of
 
 if TYPE_CHECKING:
     from pbfd_torch.simulator import Simulator

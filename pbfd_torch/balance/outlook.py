@@ -13,9 +13,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.assembly import Balance
-from pbfd_torch.kinematics import Motion, Placement, retract
+from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.terms.load import ChordLoad, JointLoad, LinkLoad, Term
+from pbfd_torch.tree.kinematics import Motion, Placement, retract
 
 
 class Outlook:

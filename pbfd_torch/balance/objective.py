@@ -11,13 +11,12 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, force_scale, lever, reach
-from pbfd_torch.assembly import Balance
-from pbfd_torch.dynamics import armature_diagonal
+from pbfd_torch.balance.assembly import Balance
+from pbfd_torch.balance.dynamics import armature_diagonal
+from pbfd_torch.balance.outlook import Outlook
 from pbfd_torch.errors import InputError
-from pbfd_torch.kinematics import Placement, place, retract
-from pbfd_torch.outlook import Outlook
 from pbfd_torch.solvers.objective import Evaluation, weighted_error
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import (
@@ -33,7 +32,8 @@ from pbfd_torch.terms.load import (
     StepContext,
     Term,
 )
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation, force_scale, lever, reach
+from pbfd_torch.tree.kinematics import Placement, place, retract
 
 NEGLIGIBLE = 0.1  # of the scale, at most, may be left to rounding
 

@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.parameters import mapped_tensors, tensors_of
-from pbfd_torch.plain import plain
+from pbfd_torch.stepping.way import Way
+from pbfd_torch.tensors.plain import plain
+from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.load import Term
-from pbfd_torch.way import Way
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation
 
 if TYPE_CHECKING:
     from pbfd_torch.simulator import Simulator

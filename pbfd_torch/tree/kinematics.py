@@ -11,8 +11,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation, homogeneous
-from pbfd_torch.rotations import (
+from pbfd_torch.tree.articulation import Articulation, homogeneous
+from pbfd_torch.tree.rotations import (
     quaternion_conjugate,
     quaternion_exp,
     quaternion_log,

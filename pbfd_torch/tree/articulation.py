@@ -20,9 +20,9 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError, ModelError
-from pbfd_torch.rotations import quaternion_matrix, skew
-from pbfd_torch.topology import Topology
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.rotations import quaternion_matrix, skew
+from pbfd_torch.tree.topology import Topology
 
 
 class JointKind(enum.Enum):

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.assembly import Balance
-from pbfd_torch.kinematics import Motion, Placement, link_residual, place, subtree_sum
-from pbfd_torch.rotations import unskew
+from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.terms.inertia import inertia_stiffness
 from pbfd_torch.terms.joint_springs import Armature
 from pbfd_torch.terms.load import LinkLoad, Term
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import Motion, Placement, link_residual, place, subtree_sum
+from pbfd_torch.tree.rotations import unskew
 
 
 def armature_diagonal(articulation: Articulation, terms: Sequence[Term]) -> Tensor:

@@ -14,17 +14,17 @@ from typing import Any, Generic, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
+from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.integrators.integrator import Integrator, S
-from pbfd_torch.kinematics import place
-from pbfd_torch.linked import Linked
-from pbfd_torch.objective import BalanceObjective
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import SHORTEST_STEP, Simulator, Solver, put
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
-from pbfd_torch.way import Way
-from pbfd_torch.worlds import Worlds, replaced
+from pbfd_torch.stepping.way import Way
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import place
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
 ORDER = 3  # of the error of one step

@@ -5,8 +5,7 @@ A name is the path of attributes that leads to the number: `articulation.pseudo_
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -14,8 +13,8 @@ from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.scene import Scene
-from pbfd_torch.topology import Topology
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.structures import fields_of
+from pbfd_torch.tensors.worlds import replaced
 
 _PARTS = ("articulation", "terms", "gravity")  # of a scene: what a step knows of it
 
@@ -55,7 +54,7 @@ def _changed(value: Any, name: str, values: dict[str, Tensor]) -> Any:
         return value
     if isinstance(value, list | tuple):
         return tuple(_changed(x, f"{name}.{k}", values) for k, x in enumerate(value))
-    fields = dict(_fields(value))
+    fields = dict(fields_of(value))
     return replaced(value, **{key: _changed(x, f"{name}.{key}", values) for key, x in fields.items()}) if fields else value
 
 
@@ -70,40 +69,5 @@ def _named(value: Any, name: str) -> Iterator[tuple[str, float | Tensor]]:
             if not isinstance(x, float):  # what is a tuple of numbers stays one
                 yield from _named(x, f"{name}.{k}")
     else:
-        for key, x in _fields(value):
+        for key, x in fields_of(value):
             yield from _named(x, f"{name}.{key}")
-
-
-def _fields(value: Any) -> Iterator[tuple[str, Any]]:
-    """The fields of a dataclass that may hold tensors: of numbers only those that might be one."""
-    if not dataclasses.is_dataclass(value) or isinstance(value, Topology | type):
-        return
-    for field in dataclasses.fields(value):
-        x = getattr(value, field.name)
-        if not isinstance(x, float) or "Tensor" in str(field.type):
-            yield field.name, x
-
-
-def tensors_of(structure: Any) -> list[Tensor]:
-    """All tensors in a structure of dataclasses, tuples and lists, in a fixed order."""
-    if isinstance(structure, Tensor):
-        return [structure]
-    items = structure if isinstance(structure, list | tuple) else [x for _, x in _fields(structure)]
-    return [x for item in items for x in tensors_of(item)]
-
-
-def mapped_tensors(structure: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """The same structure with the function of every tensor in it; what has none that changes is kept as it is."""
-    if isinstance(structure, Tensor):
-        return function(structure)
-    if isinstance(structure, list | tuple):
-        items = [mapped_tensors(x, function) for x in structure]
-        same = all(a is b for a, b in zip(items, structure, strict=True))
-        return structure if same else type(structure)(items)
-    fields = {key: mapped_tensors(x, function) for key, x in _fields(structure)}
-    return replaced(structure, **fields) if fields else structure
-
-
-def in_dtype(structure: Any, dtype: torch.dtype) -> Any:
-    """The same structure with its floating-point tensors in another type."""
-    return mapped_tensors(structure, lambda x: x.to(dtype) if x.is_floating_point() else x)

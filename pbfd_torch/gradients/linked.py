@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from pbfd_torch.errors import GradientError, GradientWarning
-from pbfd_torch.implicit import Doubt, Doubtful, Factors, followed
+from pbfd_torch.gradients.implicit import Doubt, Doubtful, Factors, followed
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.parameters import in_dtype, mapped_tensors, tensors_of
-from pbfd_torch.plain import plain, wrapped
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
-from pbfd_torch.way import Way
+from pbfd_torch.stepping.way import Way
+from pbfd_torch.tensors.plain import plain, wrapped
+from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
 
 if TYPE_CHECKING:
     from pbfd_torch.simulator import Simulator

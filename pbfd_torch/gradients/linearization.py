@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Generic
 import torch
 from torch import Tensor
 
-from pbfd_torch.articulation import Articulation
-from pbfd_torch.implicit import Doubt, Doubtful, followed
+from pbfd_torch.gradients.implicit import Doubt, Doubtful, followed
+from pbfd_torch.gradients.linked import complain, doubts_of
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.kinematics import difference, retract
-from pbfd_torch.linked import complain, doubts_of
-from pbfd_torch.parameters import in_dtype, mapped_tensors, tensors_of
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.worlds import replaced
+from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
+from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.kinematics import difference, retract
 
 if TYPE_CHECKING:
     from pbfd_torch.simulator import Simulator

@@ -14,15 +14,15 @@ from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.recording import Recorder
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.recording import Recorder
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent, renewed
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.lock_step import FEWEST_LANES, solution
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 
 
 class Policy(Protocol):

@@ -15,9 +15,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.chords import ChordBalance
-from pbfd_torch.kinematics import Placement, link_jacobians, link_residual, subtree_sum
+from pbfd_torch.balance.chords import ChordBalance
 from pbfd_torch.terms.load import ChordLoad, JointLoad, LinkLoad, Load
+from pbfd_torch.tree.kinematics import Placement, link_jacobians, link_residual, subtree_sum
 
 
 def _total(values: Iterable[Tensor]) -> Tensor:

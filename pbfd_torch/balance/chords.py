@@ -14,9 +14,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.kinematics import link_residual, subtree_sum
-from pbfd_torch.rotations import skew, unskew
 from pbfd_torch.terms.load import ChordLoad
+from pbfd_torch.tree.kinematics import link_residual, subtree_sum
+from pbfd_torch.tree.rotations import skew, unskew
 
 
 class ChordBalance:

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds
 
 
 class Workers:

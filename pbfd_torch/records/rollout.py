@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch.appearance import Appearance, packed, unpacked
 from pbfd_torch.errors import InputError
+from pbfd_torch.looks.appearance import Appearance, packed, unpacked
 from pbfd_torch.solvers.objective import FALLBACKS, is_solved
 
 FORMAT = "pbfd_torch rollout 5"

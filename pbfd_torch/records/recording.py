@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.depiction import depicted
-from pbfd_torch.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
+from pbfd_torch.balance.dynamics import center_of_mass, kinetic_energy, momentum, rotor_energy
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.integrator import Integrator, State
-from pbfd_torch.kinematics import Placement, place
-from pbfd_torch.objective import BalanceObjective
-from pbfd_torch.rollout import Rollout
+from pbfd_torch.records.depiction import depicted
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
-
-if TYPE_CHECKING:
-    from pbfd_torch.scene import Scene
+from pbfd_torch.tree.kinematics import Placement, place
 
 
 class Records:
