@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from pbfd_torch.envs.packing import packed, unpacked
-from pbfd_torch.envs.randomization import Randomization
+from pbfd_torch.envs.randomization import DrawnWorlds, Randomization
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, State
@@ -121,6 +121,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.scene = self.setup.scene
         # a world that is hard to solve ends sooner than others wait for it
         self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler(), halvings=HALVINGS)
+        self._worlds = None if randomization is None else DrawnWorlds(self.simulator, randomization)
         (bank,) = (term for term in self.scene.terms if isinstance(term, Actuators))
         self.low, self.high = bank.control_range.unbind(-1)
         if not bool(torch.isfinite(bank.control_range).all()):
@@ -288,10 +289,9 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
 
     def _of(self, drawn: Mapping[str, Tensor] | None) -> Simulator[Any]:
         """The simulator of worlds with what they have drawn."""
-        if self.randomization is None or drawn is None:
+        if self._worlds is None or drawn is None:
             return self.simulator
-        scene = self.randomization.applied(self.scene, {name: drawn[name] for name in DRAWN})
-        return Simulator(scene, self.dt, self.simulator.integrator, self.simulator.solver, self.simulator.halvings)
+        return self._worlds.simulator(*(drawn[name] for name in DRAWN))
 
     def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
         """Packed states at q with v, at the first step of an episode."""

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.parameters import parameters, with_parameters
-from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.pushes import Pushes
 
 Range = tuple[float, float]
@@ -55,9 +57,10 @@ class Randomization:
 
     def drawn(self, worlds: int, random: torch.Generator) -> dict[str, Tensor]:
         """Factors of mass, friction and gain `[worlds, 3]`, and no push yet, `[worlds, 3]` [N]."""
-        low, high = torch.tensor([self.mass, self.friction, self.gain], dtype=torch.float64, device=random.device).unbind(-1)
-        share = torch.rand(worlds, 3, generator=random, dtype=torch.float64, device=random.device)
-        return {"world_factors": low + (high - low) * share, "world_push": torch.zeros_like(share)}
+        shares = torch.rand(worlds, 3, generator=random, dtype=torch.float64, device=random.device)
+        ranges = (self.mass, self.friction, self.gain)
+        factors = [low + (high - low) * share for (low, high), share in zip(ranges, shares.unbind(-1), strict=True)]
+        return {"world_factors": torch.stack(factors, -1), "world_push": torch.zeros_like(shares)}
 
     def pushed(self, push: Tensor, random: torch.Generator) -> Tensor:
         """The pushes of the next control step: in some worlds one begins, or ends."""
@@ -71,18 +74,32 @@ class Randomization:
         begun = (push == 0).all(-1, keepdim=True)
         return torch.where((chance < self.push_probability)[:, None], torch.where(begun, fresh, torch.zeros_like(fresh)), push)
 
-    def applied(self, scene: Scene, drawn: dict[str, Tensor]) -> Scene:
-        """The scene of the worlds with what was drawn for them."""
-        a = scene.articulation
-        mass, friction, gain = drawn["world_factors"].to(a.dtype).unbind(-1)
-        terms = [replaced(term, gear=term.gear * gain[:, None]) if isinstance(term, Actuators) else term for term in scene.terms]
-        if self.push > 0:
-            force = torch.zeros((len(mass), a.nlink, 3), dtype=a.dtype, device=a.device)
-            force[:, 0] = drawn["world_push"].to(a.dtype)
-            terms.append(Pushes.at_centers(a, force))
+
+class DrawnWorlds:
+    """The simulators of worlds that have drawn their numbers. What a device would have to be asked is asked once, here."""
+
+    def __init__(self, simulator: Simulator[Any], randomization: Randomization) -> None:
+        self._simulator, scene = simulator, simulator.scene
+        self._friction = {}
+        if randomization.friction != (1.0, 1.0):
+            self._friction = {name: value for name, value in parameters(scene).items() if name.endswith(".friction.mu")}
+        if randomization.push > 0:
+            a = scene.articulation
+            scene = replaced(scene, terms=(*scene.terms, Pushes.at_centers(a, a.rest.new_zeros(1, a.nlink, 3))))
+        self._scene = scene
+
+    def simulator(self, factors: Tensor, push: Tensor) -> Simulator[Any]:
+        """Of worlds with these factors of mass, friction and gain `[worlds, 3]` and pushes `[worlds, 3]` [N]."""
+        a = self._scene.articulation
+        mass, friction, gain = factors.to(a.dtype).unbind(-1)
+        links = torch.nn.functional.pad(push.to(a.dtype)[:, None], (0, 0, 0, a.nlink - 1))
+        terms: list[Term] = []
+        for term in self._scene.terms:
+            if isinstance(term, Actuators):
+                terms.append(replaced(term, gear=term.gear * gain[:, None]))
+            else:
+                terms.append(replaced(term, force=links) if isinstance(term, Pushes) else term)
         scaled = replaced(a, pseudo_inertia=a.pseudo_inertia * mass[:, None, None, None])
-        scene = replaced(scene, articulation=scaled, terms=tuple(terms))
-        if self.friction == (1.0, 1.0):
-            return scene
-        mus = {name: value for name, value in parameters(scene).items() if name.endswith(".friction.mu")}
-        return with_parameters(scene, {name: value * friction[:, None] for name, value in mus.items()})
+        scene = replaced(self._scene, articulation=scaled, terms=tuple(terms))
+        scene = with_parameters(scene, {name: value * friction[:, None] for name, value in self._friction.items()})
+        return self._simulator.with_scene(scene)

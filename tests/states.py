@@ -7,7 +7,8 @@ from torch import Tensor
 
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.scene import Scene
-from pbfd_torch.simulator import Simulator, Solver
+from pbfd_torch.simulator import Simulator
+from pbfd_torch.stepping.stepper import Solver
 
 
 def state_of(q: Tensor, q_previous: Tensor) -> Positions:

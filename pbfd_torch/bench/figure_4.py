@@ -19,11 +19,12 @@ from pbfd_torch.bench.timing import Progress, timed, worst
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models.chains import LENGTH
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.simulator import Simulator, Solver
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import TABLE_1, OnLagged, OnSquares
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.tree.kinematics import place
 
 CHAINS = ("chain-fixed", "chain-ground")

@@ -27,9 +27,10 @@ from pbfd_torch.bench.timing import Progress
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider
 from pbfd_torch.scene import Scene
-from pbfd_torch.simulator import Simulator, Solver
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnLagged, lm
+from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.terms.calibration import effective_mu, load_per_point, normal_force_for
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction

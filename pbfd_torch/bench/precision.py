@@ -22,8 +22,7 @@ from pbfd_torch.bench.timing import Progress
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.schedules.adaptive import AdaptiveSimulator
-from pbfd_torch.simulator import Simulator
+from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 
 OURS, PEER, ADAPTIVE = "pbfd_torch", "MuJoCo", "adaptive"

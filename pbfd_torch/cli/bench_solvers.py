@@ -18,7 +18,7 @@ from tqdm import tqdm
 from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import Choices, load_setup, use_threads
 from pbfd_torch.errors import InputError
-from pbfd_torch.simulator import SHORTEST_STEP
+from pbfd_torch.stepping.stepper import SHORTEST_STEP
 
 LONGEST_STEP = 0.1  # [s]: the paper's largest
 MOST_STEPS, MOST_WORLDS, MOST_REPEATS, MOST_DOFS = 10_000, 4096, 1000, 200

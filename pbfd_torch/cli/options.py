@@ -16,11 +16,11 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES, Setup, file_setup
 from pbfd_torch.scene import Scene
-from pbfd_torch.schedules.adaptive import AdaptiveSimulator
-from pbfd_torch.simulator import Simulator, Solver
+from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
+from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact, ContactPoints
 from pbfd_torch.terms.touching import shifting
@@ -29,7 +29,15 @@ class ContactJacobian:
     jacobian: Tensor
 
 
-def contact_jacobians(simulator: Simulator[Any], state: State, control: Tensor | None = None) -> list[ContactJacobian]:
+class Balanced(Protocol):
+    """What knows the balance of a step: a `Simulator`, an `EagerStepper`."""
+
+    def objective(self, state: Any, control: Tensor | None = None) -> BalanceObjective:
+        """The balance of forces that the step from `state` solves."""
+        ...
+
+
+def contact_jacobians(simulator: Balanced, state: State, control: Tensor | None = None) -> list[ContactJacobian]:
     """Of every contact term in the scene's order, at a state, as the step that begins there sees them."""
     objective = simulator.objective(state, control)
     placement = objective.step.previous

@@ -15,9 +15,7 @@ First derivatives only: a second one would need ∂J/∂q, and asking for it is 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -25,18 +23,11 @@ from torch import Tensor
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import S
+from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.plain import plain
 from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import Worlds
-from pbfd_torch.terms.load import Term
-from pbfd_torch.tree.articulation import Articulation
-
-if TYPE_CHECKING:
-    from pbfd_torch.simulator import Simulator
-
-Attempt = Callable[["Simulator[Any]", Any, Tensor | None], tuple[Any, Tensor]]
-"""Makes a step and says where it ended and which worlds `[*batch]` it solved."""
 
 SINGULAR = 64.0  # of the machine's ε: a pivot this small is rounding
 
@@ -84,17 +75,6 @@ class Gradients:
     doubtful: Doubtful = Doubtful.RAISE
     blur: Blur | None = None
     keep_factors: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """What a simulator's steps depend on besides the state and the control; adapted: the terms as they act in a step."""
-
-    articulation: Articulation
-    terms: Sequence[Term]
-    gravity: Tensor
-    step_size: Tensor
-    adapted: Sequence[Term]
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +129,11 @@ def attached(objective: BalanceObjective, q: Tensor, blur: Blur | None, factors:
 
 
 def followed(
-    simulator: Simulator[S],
+    stepper: EagerStepper[S],
     state: S,
     control: Tensor | None,
     way: Way,
+    blur: Blur | None = None,
     included: Tensor | None = None,
     kept: list[Factors] | None = None,
 ) -> tuple[S, Tensor]:
@@ -161,15 +142,15 @@ def followed(
     batch = tuple(way.q.shape[:-1])
     pieces = []
     for worlds, detour, legs in way.groups(included):
-        part, now, held = simulator, state, control
+        part, now, held = stepper, state, control
         if worlds is not None:
-            part, now = simulator.take(worlds), state.take(worlds)
+            part, now = stepper.take(worlds), state.take(worlds)
             held = None if control is None else worlds.pick(control, 1)
         before = part
         if detour is not None:
             solver, size = part.solver, part.step_size
             part = part.with_scheme(detour.scheme, solver, 0, size / len(legs) if len(legs) > 1 else size)
-        end, singular = _along(part, before, now, held, legs, kept if worlds is None else None)
+        end, singular = _along(part, before, now, held, legs, blur, kept if worlds is None else None)
         if worlds is None:
             return end, singular
         pieces.append((worlds, end, singular))
@@ -177,27 +158,28 @@ def followed(
 
 
 def _along(
-    simulator: Simulator[S],
-    whole: Simulator[S],
+    stepper: EagerStepper[S],
+    whole: EagerStepper[S],
     state: S,
     control: Tensor | None,
     legs: tuple[Way, ...],
+    blur: Blur | None,
     kept: list[Factors] | None,
 ) -> tuple[S, Tensor]:
     """One step, or several shorter ones in place of it."""
-    integrator, a = simulator.integrator, simulator.articulation
+    integrator, a = stepper.integrator, stepper.articulation
     if len(legs) == 1:
-        objective = simulator.objective(state, control)
-        q, factors = attached(objective, _resolved(objective, legs[0].q), simulator.gradients.blur, kept[0] if kept else None)
+        objective = stepper.objective(state, control)
+        q, factors = attached(objective, _resolved(objective, legs[0].q), blur, kept[0] if kept else None)
         if kept is not None and not kept:
             kept.append(factors.plain())
         return integrator.advance(objective, state, q)[0], factors.singular
-    now = integrator.resized(a, state, whole.step_size, simulator.step_size)
+    now = integrator.resized(a, state, whole.step_size, stepper.step_size)
     lost = torch.zeros_like(state.time, dtype=torch.bool)
     for leg in legs:
-        now, singular = followed(simulator, now, control, leg)
+        now, singular = followed(stepper, now, control, leg, blur)
         lost = lost | singular
-    return integrator.resized(a, now, simulator.step_size, whole.step_size), lost
+    return integrator.resized(a, now, stepper.step_size, whole.step_size), lost
 
 
 def _resolved(objective: BalanceObjective, q: Tensor) -> Tensor:

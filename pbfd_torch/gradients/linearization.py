@@ -7,22 +7,21 @@ and the velocity. Configurations move in the exponential chart, so they have nv 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Generic
+from typing import Generic, Protocol
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.gradients.implicit import Doubt, Doubtful, followed
+from pbfd_torch.gradients.implicit import Doubt, Doubtful, Gradients, followed
 from pbfd_torch.gradients.linked import complain, doubts_of
-from pbfd_torch.integrators.integrator import S
+from pbfd_torch.gradients.parts import precise
+from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import difference, retract
-
-if TYPE_CHECKING:
-    from pbfd_torch.simulator import Simulator
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +39,22 @@ class Linearization(Generic[S]):
     doubts: Tensor
 
 
+class Scheme(Protocol[S]):
+    """What has an articulation and an integrator: a `Simulator`, a stepper."""
+
+    @property
+    def articulation(self) -> Articulation: ...
+
+    @property
+    def integrator(self) -> Integrator[S]: ...
+
+
 class Chart(Generic[S]):
     """States near a state by their coordinates x `[*, nx]`, `*` having the batch's dimensions last.
 
     `layout`: the slice of x that each part of the state has. `size`: nx."""
 
-    def __init__(self, simulator: Simulator[S], state: S) -> None:
+    def __init__(self, simulator: Scheme[S], state: S) -> None:
         self._articulation: Articulation = simulator.articulation
         self.state = state
         configurations, others = simulator.integrator.coordinates
@@ -90,25 +99,25 @@ class Chart(Generic[S]):
         return torch.cat(found, -1)
 
 
-def linearized(simulator: Simulator[S], state: S, control: Tensor | None) -> Linearization[S]:
+def linearized(stepper: EagerStepper[S], gradients: Gradients, state: S, control: Tensor | None) -> Linearization[S]:
     """See `Simulator.linearize`."""
-    nu = simulator.scene.nu
-    end, solution, _, way = simulator.made(state, control)
+    nu = stepper.scene.nu
+    end, solution, way = stepper.made(state, control)
     doubts = doubts_of(solution.status)
-    precise = simulator.precise()
-    before, after = (Chart(precise, in_dtype(x, torch.float64)) for x in (state, end))
+    wide = precise(stepper)
+    before, after = (Chart(wide, in_dtype(x, torch.float64)) for x in (state, end))
     # one copy of the batch for every coordinate of the end: a single pass back gives a row of A and B each
     like = before.state.q
     x = like.new_zeros((after.size, *state.time.shape, before.size), requires_grad=True)
     held = like.new_zeros(nu) if control is None else control.detach().double()
     u = held.expand(after.size, *state.time.shape, nu).clone().requires_grad_()
     with torch.enable_grad():
-        reached, singular = followed(precise, before.at(x), u if nu else None, way.repeated(after.size))
+        reached, singular = followed(wide, before.at(x), u if nu else None, way.repeated(after.size), gradients.blur)
         rows = after.of(reached)
     seed = torch.eye(after.size, dtype=x.dtype, device=x.device)
     seed = seed.reshape(after.size, *(1,) * state.time.ndim, after.size).expand_as(rows)
     found = torch.autograd.grad(rows, (x, u), seed, allow_unused=True, materialize_grads=True)
-    policy = simulator.gradients.doubtful
+    policy = gradients.doubtful
     doubts = doubts | int(Doubt.SINGULAR) * singular[0].int()
     complain(policy, doubts, state.time)
     lost = (doubts & int(Doubt.UNSOLVED | Doubt.SINGULAR)) > 0 if policy is Doubtful.ZERO else torch.zeros_like(doubts) > 0

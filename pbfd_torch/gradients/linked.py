@@ -9,29 +9,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from pbfd_torch.errors import GradientError, GradientWarning
-from pbfd_torch.gradients.implicit import Doubt, Doubtful, Factors, followed
+from pbfd_torch.gradients.implicit import Doubt, Doubtful, Factors, Gradients, followed
+from pbfd_torch.gradients.parts import carries, of_parts, parts_of, precise
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
+from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.plain import plain, wrapped
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
-
-if TYPE_CHECKING:
-    from pbfd_torch.simulator import Simulator
-
-
-def carries(value: Tensor) -> bool:
-    """Whether a tensor carries derivatives, backward or forward ones."""
-    if torch.is_grad_enabled() and value.requires_grad:
-        return True
-    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
 
 
 def doubts_of(status: Tensor) -> Tensor:
@@ -57,32 +48,38 @@ class Made:
 
 
 class Linked(Generic[S]):
-    """The steps of a simulator as functions that carry derivatives.
+    """The steps of a stepper as functions that carry derivatives.
 
-    `active`: the positions, among all tensors of the simulator's parts, of those that carry any."""
+    `gradients`: how they are differentiated. `active`: the positions, among all tensors of the stepper's parts, of those that carry
+    any."""
 
-    def __init__(self, simulator: Simulator[S]) -> None:
-        self.simulator = simulator
-        self.parts = simulator.parts
+    def __init__(self, stepper: EagerStepper[S], gradients: Gradients) -> None:
+        self.stepper = stepper
+        self.gradients = gradients
+        self.parts = parts_of(stepper)
         self.leaves = tensors_of(self.parts)
         self.active = [k for k, x in enumerate(self.leaves) if carries(x) or wrapped(x)]
-        self._plain: Simulator[S] | None = None
+        self._plain: EagerStepper[S] | None = None
 
-    def plain(self, values: Sequence[Tensor]) -> Simulator[S]:
-        """The simulator without derivatives, from plain values of the active tensors."""
+    def carry(self, *values: Any) -> bool:
+        """Whether steps from these values carry derivatives."""
+        return bool(self.active) or any(map(carries, tensors_of(list(values))))
+
+    def plain(self, values: Sequence[Tensor]) -> EagerStepper[S]:
+        """The stepper without derivatives, from plain values of the active tensors."""
         if self._plain is None:
-            self._plain = self.with_values(values) if self.active else self.simulator
+            self._plain = self.with_values(values) if self.active else self.stepper
         return self._plain
 
-    def with_values(self, values: Sequence[Tensor]) -> Simulator[S]:
-        """The simulator with other values of the active tensors."""
+    def with_values(self, values: Sequence[Tensor]) -> EagerStepper[S]:
+        """The stepper with other values of the active tensors."""
         if not self.active:
-            return self.simulator
+            return self.stepper
         leaves = list(self.leaves)
         for k, value in zip(self.active, values, strict=True):
             leaves[k] = value
         order = iter(leaves)
-        return self.simulator.of_parts(mapped_tensors(self.parts, lambda _: next(order)))
+        return of_parts(self.stepper, mapped_tensors(self.parts, lambda _: next(order)))
 
     def step(self, state: S, control: Tensor | None) -> tuple[S, Made]:
         """See `Simulator.step`."""
@@ -104,7 +101,7 @@ _Function = Callable[..., tuple[Tensor, ...]]
 
 class Play(Generic[T]):
     """A computation that is made without derivatives first and retraced with them later. Its inputs: all tensors of `start` and of
-    the control, and the simulator's active ones."""
+    the control, and the stepper's active ones."""
 
     def __init__(self, linked: Linked[Any], start: Any, control: Tensor | None) -> None:
         self.linked = linked
@@ -141,11 +138,11 @@ class Play(Generic[T]):
         start, control, active = self._unpacked(values)
         return tuple(tensors_of(self.again(self.linked.with_values(active), start, control)))
 
-    def first(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+    def first(self, stepper: EagerStepper[Any], start: Any, control: Tensor | None) -> Any:
         """Made without derivatives."""
         raise NotImplementedError
 
-    def again(self, simulator: Simulator[Any], start: Any, control: Tensor | None) -> Any:
+    def again(self, stepper: EagerStepper[Any], start: Any, control: Tensor | None) -> Any:
         """The same as a function that carries derivatives."""
         raise NotImplementedError
 
@@ -155,19 +152,21 @@ class Step(Play[S]):
 
     made: Made | None = None
 
-    def first(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
-        end, solution, _, way = simulator.made(start, control)
-        self.made = Made(solution, way, doubts_of(solution.status), [] if simulator.gradients.keep_factors else None)
+    def first(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> S:
+        end, solution, way = stepper.made(start, control)
+        self.made = Made(solution, way.kept(), doubts_of(solution.status), [] if self.linked.gradients.keep_factors else None)
         return end
 
-    def again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> S:
-        made, policy = self.made, simulator.gradients.doubtful
+    def again(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> S:
+        made, gradients = self.made, self.linked.gradients
+        policy = gradients.doubtful
         assert made is not None
         unsolved = (made.doubts & int(Doubt.UNSOLVED)) > 0
         included = ~unsolved if policy is Doubtful.ZERO and bool(unsolved.any()) else None
         dtype = start.time.dtype
-        wide, held = simulator.precise(), None if control is None else control.double()
-        end, singular = followed(wide, in_dtype(start, torch.float64), held, made.way, included, made.factors)
+        wide, held = precise(stepper), None if control is None else control.double()
+        begin = in_dtype(start, torch.float64)
+        end, singular = followed(wide, begin, held, made.way, gradients.blur, included, made.factors)
         made.doubts = made.doubts | int(Doubt.SINGULAR) * plain(singular).int()
         complain(policy, made.doubts, start.time)
         lost = (made.doubts & int(Doubt.SINGULAR)) > 0
@@ -178,27 +177,27 @@ class Step(Play[S]):
 class _Start(Play[S]):
     """The state at t = 0 of a configuration and a velocity."""
 
-    def first(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+    def first(self, stepper: EagerStepper[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
         self._trials: list[tuple[Way, Tensor]] = []
 
-        def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
-            end, solution, _, way = trial.made(state, held)
-            self._trials.append((way, solution.solved))
+        def attempt(trial: EagerStepper[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
+            end, solution, way = trial.made(state, held)
+            self._trials.append((way.kept(), solution.solved))
             return end, solution.solved
 
         # what a node gives back must not share memory with what it was given, nor among itself, for forward derivatives
-        return mapped_tensors(simulator.with_attempt(attempt).started(*start, control), torch.clone)
+        return mapped_tensors(stepper.with_attempt(attempt).initial_state(*start, control), torch.clone)
 
-    def again(self, simulator: Simulator[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
-        trials, dtype = iter(self._trials), start[0].dtype
+    def again(self, stepper: EagerStepper[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
+        trials, dtype, blur = iter(self._trials), start[0].dtype, self.linked.gradients.blur
 
-        def attempt(trial: Simulator[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
+        def attempt(trial: EagerStepper[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
             way, solved = next(trials)
-            return followed(trial, state, held, way)[0], solved
+            return followed(trial, state, held, way, blur)[0], solved
 
-        wide, held = simulator.precise().with_attempt(attempt), None if control is None else control.double()
+        wide, held = precise(stepper).with_attempt(attempt), None if control is None else control.double()
         q, v = (x.double() for x in start)
-        begin: S = in_dtype(wide.started(q, v, held), dtype)
+        begin: S = in_dtype(wide.initial_state(q, v, held), dtype)
         return begin
 
 

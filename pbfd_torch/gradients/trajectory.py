@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic
+from typing import Any, Generic
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.gradients.linked import Linked, Made, Play, carries, doubts_of
+from pbfd_torch.gradients.implicit import Gradients
+from pbfd_torch.gradients.linked import Linked, Made, Play, doubts_of
+from pbfd_torch.gradients.parts import carries
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import is_solved
+from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.structures import tensors_of
-
-if TYPE_CHECKING:
-    from pbfd_torch.simulator import Simulator
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,35 +63,36 @@ class _Segment(Play[S]):
         self.made: list[Made] = []
         self.status: list[Tensor] = []
 
-    def first(self, simulator: Simulator[S], start: S, control: Tensor | None) -> Any:
+    def first(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> Any:
         """See `Play`: configurations and velocities after every step, and the last state."""
         states = [start]
         for k in range(self._steps):
-            end, solution, *_ = simulator.made(states[-1], None if control is None else control[k])
+            end, solution, _ = stepper.made(states[-1], None if control is None else control[k])
             states.append(end)
             self.status.append(solution.status)
-        return _seen(simulator, states)
+        return _seen(stepper, states)
 
-    def again(self, simulator: Simulator[S], start: S, control: Tensor | None) -> Any:
+    def again(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> Any:
         """See `Play`."""
-        states, linked = [start], Linked(simulator)
+        states, linked = [start], Linked(stepper, self.linked.gradients)
         self.made.clear()
         for k in range(self._steps):
             end, made = linked.step(states[-1], None if control is None else control[k])
             states.append(end)
             self.made.append(made)
-        return _seen(simulator, states)
+        return _seen(stepper, states)
 
 
-def _seen(simulator: Simulator[S], states: list[S]) -> tuple[Tensor, Tensor, S]:
+def _seen(stepper: EagerStepper[S], states: list[S]) -> tuple[Tensor, Tensor, S]:
     """Configurations and velocities of all states but the first, and the last one."""
-    a, dt = simulator.articulation, simulator.step_size
-    v = [simulator.integrator.velocity(a, state, dt) for state in states[1:]]
+    a, dt = stepper.articulation, stepper.step_size
+    v = [stepper.integrator.velocity(a, state, dt) for state in states[1:]]
     return torch.stack([state.q for state in states[1:]]), torch.stack(v), states[-1]
 
 
 def trajectory(
-    simulator: Simulator[S],
+    stepper: EagerStepper[S],
+    gradients: Gradients,
     state: S,
     controls: Tensor | None,
     steps: int | None,
@@ -101,18 +102,19 @@ def trajectory(
     """See `Simulator.trajectory`."""
     if checkpoint < 1:
         raise InputError(f"checkpoint is {checkpoint}: must be a number of steps ≥ 1")
-    count = simulator.scene.step_count(controls, steps)
-    linked = simulator.linked(state, controls)
-    given = tensors_of([state, controls, *([] if linked is None else linked.leaves)])
+    count = stepper.scene.step_count(controls, steps)
+    linked = Linked(stepper, gradients)
+    carrying = linked.carry(state, controls)
+    given = tensors_of([state, controls, *linked.leaves])
     if any(carries(x) and not x.requires_grad for x in given):
         checkpoint = 1  # forward derivatives keep nothing, so there is nothing to save
-    q, v = [state.q[None]], [simulator.integrator.velocity(simulator.articulation, state, simulator.step_size)[None]]
+    q, v = [state.q[None]], [stepper.integrator.velocity(stepper.articulation, state, stepper.step_size)[None]]
     status: list[Tensor] = []
     kept: list[Sequence[Made]] = []
     for k in range(0, count, checkpoint):
         size = min(checkpoint, count - k)
         held = None if controls is None else controls[k : k + size]
-        if linked is not None and checkpoint > 1:
+        if carrying and checkpoint > 1:
             segment = _Segment(linked, state, held, size)
             *seen, state = segment.perform(state, held)
             status += segment.status
@@ -121,15 +123,15 @@ def trajectory(
             states = [state]
             for i in range(size):
                 now = None if held is None else held[i]
-                if linked is None:
-                    end, solution, *_ = simulator.made(states[-1], now)
-                else:
+                if carrying:
                     end, made = linked.step(states[-1], now)
                     solution = made.solution
                     kept.append([made])
+                else:
+                    end, solution, _ = stepper.made(states[-1], now)
                 states.append(end)
                 status.append(solution.status)
-            *seen, state = _seen(simulator, states)
+            *seen, state = _seen(stepper, states)
         q.append(seen[0])
         v.append(seen[1])
         if progress is not None:

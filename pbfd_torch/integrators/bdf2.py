@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, fresh
+from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, fresh
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
 from pbfd_torch.tree.articulation import Articulation
@@ -56,10 +56,10 @@ class Bdf2:
         """The terms themselves, all implicit."""
         return terms
 
-    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> FourPoses:
+    def start(self, starter: Starter, q: Tensor, v: Tensor, control: Tensor | None) -> FourPoses:
         """A past of constant acceleration, that of a trial step."""
-        a, h = stepper.articulation, stepper.step_size
-        acceleration = stepper.trial(q, v, control).acceleration
+        a, h = starter.articulation, starter.step_size
+        acceleration = starter.trial(q, v, control).acceleration
         now = place(a, q)
         motion = Motion(now, v)
         curved = motion.accelerations + Motion(now, acceleration).rates

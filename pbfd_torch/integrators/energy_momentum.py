@@ -33,7 +33,7 @@ from pbfd_torch.balance.dynamics import (
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, Refusal, State, Stepper, after, calm, fall, fresh
+from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fall, fresh
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
@@ -85,14 +85,14 @@ class EnergyMomentum:
         """Springs, damping and actuators between the trapezoidal rule and implicit Euler."""
         return fitted(articulation, terms, dt)
 
-    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> Velocities:
+    def start(self, starter: Starter, q: Tensor, v: Tensor, control: Tensor | None) -> Velocities:
         """With what contacts, limits and friction give in a trial step, unless that is an impact, which has given nothing
         before."""
-        trial, dt = stepper.trial(q, v, control), stepper.step_size
+        trial, dt = starter.trial(q, v, control), starter.step_size
         nothing = torch.zeros_like(v)
         begin = Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v)
-        objective = stepper.objective(begin, control)
-        forces = _Forces(objective, place(stepper.articulation, trial.end))
+        objective = starter.objective(begin, control)
+        forces = _Forces(objective, place(starter.articulation, trial.end))
         at = objective.step.previous
         impulse, given = dt[..., None] * forces.rough, dt[..., None] * forces.smooth
         inertia = mass_matrix_at(at, objective.terms)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Integrator, State, Stepper, after, calm, fresh
+from pbfd_torch.integrators.integrator import Integrator, Starter, State, after, calm, fresh
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
 from pbfd_torch.tree.articulation import Articulation
@@ -45,10 +45,10 @@ class ImplicitEuler:
         """The terms themselves, all implicit."""
         return terms
 
-    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> Positions:
+    def start(self, starter: Starter, q: Tensor, v: Tensor, control: Tensor | None) -> Positions:
         """θ_{−1} = θ_0 − Δt v + ½ Δt² a. Leaving out a would shift the whole motion by half a step's impulse (METHOD §5). Stiff
         contacts are felt as they will be, because a comes from a trial step."""
-        return self.at_rate(stepper.articulation, q, v, stepper.trial(q, v, control).acceleration, stepper.step_size)
+        return self.at_rate(starter.articulation, q, v, starter.trial(q, v, control).acceleration, starter.step_size)
 
     def at_rate(self, articulation: Articulation, q: Tensor, v: Tensor, acceleration: Tensor, dt: Tensor) -> Positions:
         """State at t = 0 of a motion at constant acceleration `[*batch, nv]`."""

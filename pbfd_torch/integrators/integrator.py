@@ -65,8 +65,8 @@ class Trial:
     solved: Tensor
 
 
-class Stepper(Protocol):
-    """What an integrator may ask of the simulator that it starts in."""
+class Starter(Protocol):
+    """What an integrator may ask of the stepper that it starts in."""
 
     @property
     def articulation(self) -> Articulation: ...
@@ -103,7 +103,7 @@ class Integrator(Protocol[S]):
         """The terms as they act in a step, in the same order."""
         ...
 
-    def start(self, stepper: Stepper, q: Tensor, v: Tensor, control: Tensor | None) -> S:
+    def start(self, starter: Starter, q: Tensor, v: Tensor, control: Tensor | None) -> S:
         """State at t = 0 at q `[*batch, nq]` with velocity v `[*batch, nv]`, of second order in the step."""
         ...
 

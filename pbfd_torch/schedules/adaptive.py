@@ -7,21 +7,22 @@ changes and its state is recorded.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
-from typing import Any, Generic, Self
+from typing import Generic, Self
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
-from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.scene import Scene
-from pbfd_torch.simulator import SHORTEST_STEP, Simulator, Solver, put
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
+from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Way
+from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import place
@@ -30,71 +31,88 @@ SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
 ORDER = 3  # of the error of one step
 
 
-class AdaptiveSimulator(Simulator[S]):
-    """A `Simulator` whose steps, the frames, are made of as many shorter ones as each world needs.
+class AdaptiveStepper(Generic[S]):
+    """A `Stepper` whose steps, the frames, are made of as many shorter ones as each world needs.
 
-    `dt`: length of a frame, and of the longest step [s]. `accuracy`: what a step's end may be off by, as estimated [m] > 0:
-    the root mean square over the mass of a link, the largest of all links. `shortest`: a step that is never refused [s]; None:
-    dt/4096."""
+    `fixed`: makes the steps; its own step is the length of a frame, and of the longest step [s]. `accuracy`: what a step's end may
+    be off by, as estimated [m] > 0: the root mean square over the mass of a link, the largest of all links. `shortest`: a step that
+    is never refused [s]; None: dt/4096. Raises `InputError` where one of the two is out of range."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        dt: float,
-        accuracy: float,
-        integrator: Integrator[S] | None = None,
-        solver: Solver | None = None,
-        shortest: float | None = None,
-    ) -> None:
-        super().__init__(scene, dt, integrator, solver, halvings=0)
+    def __init__(self, fixed: EagerStepper[S], accuracy: float, shortest: float | None = None) -> None:
         if not (math.isfinite(accuracy) and accuracy > 0):
             raise InputError(f"accuracy is {accuracy} m: must be > 0 and finite")
+        dt = fixed.dt
+        self.fixed = fixed
         self.accuracy = float(accuracy)
         self.shortest = max(dt / 4096, 2 * SHORTEST_STEP) if shortest is None else float(shortest)
         if not 2 * SHORTEST_STEP <= self.shortest <= max(dt, 2 * SHORTEST_STEP):
             raise InputError(f"shortest is {shortest} s: must be from {2 * SHORTEST_STEP} s to dt, {dt} s")
-        self._fixed = Simulator(scene, dt, self.integrator, self.solver, halvings=0)
 
-    def _step(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective]:
+    @property
+    def scene(self) -> Scene:
+        return self.fixed.scene
+
+    @property
+    def integrator(self) -> Integrator[S]:
+        return self.fixed.integrator
+
+    @property
+    def step_size(self) -> Tensor:
+        """Of a frame."""
+        return self.fixed.step_size
+
+    @property
+    def dt(self) -> float:
+        """Of a frame."""
+        return self.fixed.dt
+
+    @property
+    def solver(self) -> Solver:
+        return self.fixed.solver
+
+    @property
+    def halvings(self) -> int:
+        return self.fixed.halvings
+
+    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
+        """As that of steps of the frame's length."""
+        return self.fixed.initial_state(q, v, control)
+
+    def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
+        """A frame of all worlds. Its way has the balance of the last step of every world, and no way back: which steps are taken
+        depends on everything, but not smoothly."""
         with torch.no_grad():
-            frame = _Frame(self, self._fixed, state, control)
+            frame = _Frame(self, state, control)
             while frame.advance():
                 pass
             return frame.finish()
 
-    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
-        """As that of a simulator with steps of the frame's length."""
-        return self._fixed.initial_state(q, v, control)
-
-    def linked(self, *values: Any) -> Linked[S] | None:
-        """Raises `InputError` where something carries derivatives: which steps are taken depends on it, but not smoothly."""
-        if super().linked(*values) is None:
-            return None
-        raise InputError("the steps of an AdaptiveSimulator carry no derivatives: detach what requires them, or use a Simulator")
-
-    def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, BalanceObjective, Way]:
-        """Steps of no one length are made in no one way: raises `InputError`, as trajectories and linearisations need one."""
-        raise InputError("an AdaptiveSimulator has rollouts only: use a Simulator for trajectories and linearisations")
-
     def take(self, worlds: Worlds) -> Self:
-        """The simulator of some worlds."""
-        part = super().take(worlds)
-        part._fixed = self._fixed.take(worlds)
-        return part
+        """See `Stepper`."""
+        return self._of(self.fixed.take(worlds))
+
+    def sized(self, step_size: Tensor) -> Self:
+        """See `Stepper`: frames of another length."""
+        return self._of(self.fixed.sized(step_size))
+
+    def _of(self, fixed: EagerStepper[S]) -> Self:
+        other = copy.copy(self)
+        other.fixed = fixed
+        return other
 
 
 class _Frame(Generic[S]):
     """How far every world is in one frame."""
 
-    def __init__(self, simulator: AdaptiveSimulator[S], fixed: Simulator[S], state: S, control: Tensor | None) -> None:
-        self._simulator, self._fixed, self._control = simulator, fixed, control
+    def __init__(self, stepper: AdaptiveStepper[S], state: S, control: Tensor | None) -> None:
+        self._stepper, self._fixed, self._control = stepper, stepper.fixed, control
         like = torch.zeros_like(state.time)
         none = like.to(torch.int32)
         self._elapsed = like
-        self._pace = like + simulator.dt if state.pace is None else state.pace
+        self._pace = like + stepper.dt if state.pace is None else state.pace
         self._state = replaced(state, pace=None, hazards=none)
         self._before = self._state  # at the start of the last step
-        self._spacing = like + simulator.dt  # the step that the state's history is for
+        self._spacing = like + stepper.dt  # the step that the state's history is for
         self._solution = Solution(
             q=state.q,
             status=none,
@@ -107,8 +125,8 @@ class _Frame(Generic[S]):
 
     def advance(self) -> bool:
         """One step of every world that is not at the end of the frame, whole and in halves; whether there was any."""
-        left = self._simulator.dt - self._elapsed
-        index = (left > 1e-9 * self._simulator.dt).reshape(-1).nonzero().squeeze(-1)
+        left = self._stepper.dt - self._elapsed
+        index = (left > 1e-9 * self._stepper.dt).reshape(-1).nonzero().squeeze(-1)
         if len(index) == 0:
             return False
         worlds = Worlds(tuple(left.shape), index)
@@ -116,20 +134,20 @@ class _Frame(Generic[S]):
         h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left) - 1e-6)
         held = None if self._control is None else worlds.pick(self._control, 1)
         part, integrator = self._fixed.take(worlds), self._fixed.integrator
-        a = part.scene.articulation
+        a = part.articulation
         whole, half = part.sized(h), part.sized(0.5 * h)
-        coarse, first = whole.step(integrator.resized(a, now, spacing, h), held)
-        middle, second = half.step(integrator.resized(a, now, spacing, 0.5 * h), held)
-        end, third = half.step(middle, held)
+        coarse, first, _ = whole.made(integrator.resized(a, now, spacing, h), held)
+        middle, second, _ = half.made(integrator.resized(a, now, spacing, 0.5 * h), held)
+        end, third, _ = half.made(middle, held)
         end = replaced(end, hazards=now.hazards | middle.hazards | end.hazards)
 
         error = apart(a, coarse.q, end.q)
         broken = third.status == int(Status.NON_FINITE)
-        shortest = h <= 1.001 * self._simulator.shortest  # not but for rounding
-        taken = broken | shortest | ((error <= self._simulator.accuracy) & second.solved & third.solved)
-        factor = (SAFETY * (self._simulator.accuracy / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
+        shortest = h <= 1.001 * self._stepper.shortest  # not but for rounding
+        taken = broken | shortest | ((error <= self._stepper.accuracy) & second.solved & third.solved)
+        factor = (SAFETY * (self._stepper.accuracy / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
         factor = torch.where(taken, factor, factor.clamp_max(0.5))
-        pace = (h * factor).clamp(self._simulator.shortest, self._simulator.dt)
+        pace = (h * factor).clamp(self._stepper.shortest, self._stepper.dt)
 
         everywhere = torch.ones_like(taken)
         self._elapsed = put(self._elapsed, worlds.rows(self._elapsed) + torch.where(broken, left, h), worlds, taken)
@@ -162,13 +180,14 @@ class _Frame(Generic[S]):
             lanes=total.lanes + sum(x.lanes for x in tries),
         )
 
-    def finish(self) -> tuple[S, Solution, BalanceObjective]:
-        """The state at the end, how the frame was solved, and the balance of the last step of every world."""
+    def finish(self) -> tuple[S, Solution, Way]:
+        """The state at the end, how the frame was solved, and its way with the balance of the last step of every world."""
         last = self._fixed.sized(self._spacing)
         objective = last.objective(self._before, self._control)
-        a, size = self._fixed.scene.articulation, self._fixed.step_size
+        a, size = self._fixed.articulation, self._fixed.step_size
         state = self._fixed.integrator.resized(a, self._state, self._spacing, size)
-        return replaced(state, pace=self._pace), dataclasses.replace(self._solution, q=state.q), objective
+        way = Way(state.q, (), objective)
+        return replaced(state, pace=self._pace), dataclasses.replace(self._solution, q=state.q), way
 
 
 def apart(articulation: Articulation, first: Tensor, second: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ another one's iterations; only at the end of the rollout are lanes without work 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -16,12 +16,11 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent, renewed
-from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.lock_step import FEWEST_LANES, solution
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, unsolved_worlds
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -33,6 +32,13 @@ class Policy(Protocol):
         ...
 
 
+class Simulated(Protocol):
+    """What steps a scene by PyTorch: a `Simulator`."""
+
+    @property
+    def eager(self) -> EagerStepper[Any]: ...
+
+
 class AsynchronousRollout:
     """A rollout of `steps` steps from `state` `[worlds, nq]`.
 
@@ -40,23 +46,20 @@ class AsynchronousRollout:
     stuck worlds take their detours and halvings while the others wait. Raises `InputError` for another solver, for a batch that
     is not one-dimensional, and for controls of another shape."""
 
-    def __init__(self, simulator: Simulator, state: State, steps: int, control: Tensor | Policy | None = None) -> None:
-        solver = simulator.first_solver
-        self._fallbacks: Fallbacks | None
-        if isinstance(solver, Fallbacks):
-            self._direct, self._fallbacks = solver.direct, solver
-        elif isinstance(solver, Descent):
-            self._direct, self._fallbacks = solver, None
-        else:
+    def __init__(self, simulator: Simulated, state: State, steps: int, control: Tensor | Policy | None = None) -> None:
+        stepper = simulator.eager
+        solver = stepper.first_solver
+        if not isinstance(solver, Descent):
             raise InputError(f"the solver is a {type(solver).__name__}: must be a Descent or Fallbacks")
+        self._direct = solver
         if state.q.ndim != 2:
             raise InputError(f"q has shape {tuple(state.q.shape)}: must be [worlds, nq]")
         if steps < 1:
             raise InputError(f"steps is {steps}: must be ≥ 1")
-        worlds, nu = len(state.q), simulator.scene.nu
+        worlds, nu = len(state.q), stepper.scene.nu
         if isinstance(control, Tensor) and control.shape != (steps, worlds, nu):
             raise InputError(f"controls have shape {tuple(control.shape)}: must be {(steps, worlds, nu)}")
-        self._whole, self._steps, self._control = simulator, steps, control
+        self._whole, self._steps, self._control = stepper, steps, control
         device = state.q.device
 
         def counts(*event: int) -> Tensor:
@@ -77,12 +80,12 @@ class AsynchronousRollout:
         self.rounds = 0
         self.lanes = 0
         # the lanes still in use: which worlds they are, and where those stand
-        self._simulator, self._state = simulator, state
+        self._stepper, self._state = stepper, state
         self._world = torch.arange(worlds, device=device)
         self._step = torch.zeros(worlds, dtype=torch.long, device=device)
         with torch.no_grad():
             self._held = self._controlled()
-            self._objective = simulator.objective(state, self._held)
+            self._objective = stepper.objective(state, self._held)
             self._progress = self._direct.begin(self._objective, self._objective.guess, state.q)
 
     @property
@@ -115,27 +118,23 @@ class AsynchronousRollout:
         if isinstance(self._control, Tensor):
             return self._control[step, self._world]
         whole = self._whole
-        v = whole.integrator.velocity(self._simulator.scene.articulation, self._state, whole.step_size)
+        v = whole.integrator.velocity(self._stepper.articulation, self._state, whole.step_size)
         return self._control(step, self._state.q, v)
 
     def _move_on(self, ended: Tensor, index: Tensor) -> None:
         lanes = Worlds(ended.shape, index)
-        part = mapped(lambda x: x[index], self._progress)
-        found = solution(part, part.q, 0)
+        ended_there = mapped(lambda x: x[index], self._progress)
+        found = solution(ended_there, ended_there.q, 0)
         state, held = self._state.take(lanes), None if self._held is None else self._held[index]
         # for all lanes, although most are not at the end: those that are, are not worth a scene of their own
-        integrator = self._simulator.integrator
+        integrator = self._stepper.integrator
         advanced, refusal = integrator.advance(self._objective, self._state, self._progress.q)
         advanced = mapped(lambda x: x[index], advanced)
         refused = None if refusal is None else refusal()[index]
         if len(unsolved_worlds(found)) or (refused is not None and bool(refused.any())):
-            simulator = self._simulator.take(lanes)
-            if self._fallbacks is not None:
-                objective = self._objective.take(index)
-                found = self._fallbacks.rescued(objective, found, objective.guess, state.q)
-                advanced, refusal = integrator.advance(objective, state, found.q)
-                refused = None if refusal is None else refusal()
-            advanced, found, _ = simulator.finished(state, held, advanced, found, refused)
+            part = self._stepper.take(lanes)
+            objective = self._objective.take(index)
+            advanced, found, _ = part.finished(objective, state, held, found, advanced, refused)
             self.lanes += found.lanes
         self._record(index, advanced, held, found)
         self._state = mapped(lambda old, new: old.index_copy(0, index, new), self._state, advanced)
@@ -148,7 +147,7 @@ class AsynchronousRollout:
             # a policy may look at the state of every lane; the lanes in mid-step keep the control they set out with
             fresh = self._controlled()
             self._held = fresh if fresh is None or self._held is None else torch.where(ended[:, None], fresh, self._held)
-            self._objective = self._simulator.objective(self._state, self._held)
+            self._objective = self._stepper.objective(self._state, self._held)
             self._renew(ended & (self._step < self._steps))
 
     def _renew(self, where: Tensor) -> None:
@@ -167,7 +166,7 @@ class AsynchronousRollout:
         """Drops the lanes whose worlds are done; `ended` of those that stay."""
         inside = (self._step < self._steps).nonzero().squeeze(-1)
         lanes = Worlds(ended.shape, inside)
-        self._simulator = self._simulator.take(lanes)
+        self._stepper = self._stepper.take(lanes)
         self._progress = mapped(lambda x: x[inside], self._progress)
         self._state = self._state.take(lanes)
         self._world, self._step = self._world[inside], self._step[inside]

@@ -10,7 +10,7 @@ import dataclasses
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -18,8 +18,16 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.simulator import Simulator
+from pbfd_torch.schedules.lock_step import rolled_out
+from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.tensors.worlds import Worlds
+
+
+class Simulated(Protocol):
+    """What has a stepper: a `Simulator`."""
+
+    @property
+    def stepper(self) -> Stepper[Any]: ...
 
 
 class Workers:
@@ -39,7 +47,7 @@ class Workers:
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
         self._pool.shutdown(cancel_futures=True)
 
-    def rollout(self, simulator: Simulator, state: State, controls: Tensor | None = None, steps: int | None = None) -> Rollout:
+    def rollout(self, simulator: Simulated, state: State, controls: Tensor | None = None, steps: int | None = None) -> Rollout:
         """As `Simulator.rollout`, for a batch `[worlds]` on the CPU with at least as many worlds as workers; else `InputError`."""
         if state.q.ndim != 2 or state.q.device.type != "cpu":
             raise InputError(f"q has shape {tuple(state.q.shape)} on {state.q.device}: must be [worlds, nq] on the CPU")
@@ -50,12 +58,8 @@ class Workers:
         for index in torch.arange(worlds).tensor_split(self.count):
             part = Worlds((worlds,), index)
             held = None if controls is None else controls.expand(-1, worlds, -1)[:, index]
-            futures.append(self._pool.submit(_rolled_out, simulator.take(part), state.take(part), held, steps))
+            futures.append(self._pool.submit(rolled_out, simulator.stepper.take(part), state.take(part), held, steps))
         return _joined([future.result() for future in futures])
-
-
-def _rolled_out(simulator: Simulator, state: State, controls: Tensor | None, steps: int | None) -> Rollout:
-    return simulator.rollout(state, controls, steps)
 
 
 def _joined(parts: list[Rollout]) -> Rollout:

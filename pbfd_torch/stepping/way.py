@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
@@ -34,10 +35,16 @@ class Way:
     """Attributes:
     q: `[*batch, nq]` where the equations of the step itself left each world.
     detours: what was tried after it, the last one that a world keeps being the one that counts.
+    objective: the balance of the step itself, for records of its contacts; None: not kept.
     """
 
     q: Tensor
     detours: tuple[Detour, ...] = field(default=())
+    objective: BalanceObjective | None = None
+
+    def kept(self) -> Way:
+        """The way as derivatives keep it: without the balance, which they make anew."""
+        return Way(self.q, self.detours)
 
     def groups(self, included: Tensor | None) -> Iterator[tuple[Worlds | None, Detour | None, tuple[Way, ...]]]:
         """The worlds that have gone the same way, each with the detour that they kept (None: the step itself) and its legs for

@@ -106,8 +106,8 @@ class Live(Served):
 
     def _advanced(self) -> tuple[Any, Any, Any]:
         before = self._state
-        self._state, solution, objective, _ = self._simulator.made(before, self._control)
-        return before, solution, objective
+        self._state, solution, way = self._simulator.stepper.made(before, self._control)
+        return before, solution, way.objective
 
     def _record(self, before: Any, solution: Any, objective: Any) -> Rollout:
         recorder = Recorder(self._simulator.scene, self._simulator.integrator, self._dt, before)

@@ -1,0 +1,59 @@
+"""What steps depend on besides the state and the control, and a stepper of other values of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from pbfd_torch.integrators.integrator import S
+from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.structures import in_dtype, tensors_of
+from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.terms.load import Term
+from pbfd_torch.tree.articulation import Articulation
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What a stepper's steps depend on besides the state and the control; adapted: the terms as they act in a step."""
+
+    articulation: Articulation
+    terms: Sequence[Term]
+    gravity: Tensor
+    step_size: Tensor
+    adapted: Sequence[Term]
+
+
+def carries(value: Tensor) -> bool:
+    """Whether a tensor carries derivatives, backward or forward ones."""
+    if torch.is_grad_enabled() and value.requires_grad:
+        return True
+    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
+
+
+def parts_of(stepper: EagerStepper[S]) -> Parts:
+    """Those of a stepper; where they carry derivatives, so do the adapted terms."""
+    scene, terms = stepper.scene, stepper.terms
+    parts = Parts(scene.articulation, scene.terms, scene.gravity, stepper.step_size, scene.terms)
+    if any(map(carries, tensors_of(parts))):
+        terms = stepper.integrator.adapted(scene.articulation, scene.terms, stepper.step_size)
+    return replaced(parts, adapted=terms)
+
+
+def of_parts(stepper: EagerStepper[S], parts: Parts) -> EagerStepper[S]:
+    """The same stepper made of other values of its parts."""
+    scene = replaced(stepper.scene, articulation=parts.articulation, terms=parts.terms, gravity=parts.gravity)
+    return stepper.changed(scene=scene, step_size=parts.step_size, terms=parts.adapted)
+
+
+def precise(stepper: EagerStepper[S]) -> EagerStepper[S]:
+    """The same stepper in float64, itself if it is."""
+    if stepper.articulation.dtype == torch.float64:
+        return stepper
+    scene = stepper.scene
+    parts = Parts(scene.articulation, scene.terms, scene.gravity, stepper.step_size, stepper.terms)
+    return of_parts(stepper, in_dtype(parts, torch.float64)).changed(scale=stepper.scale.double())
