@@ -1,4 +1,5 @@
-"""Environments for torchrl, and for Gymnasium through its registry. Importing this package imports torchrl."""
+"""Environments for torchrl, and for Gymnasium through its registry. Importing this package imports torchrl. Built on the simulator
+and the named scenes; `learning` trains in them."""
 
 from __future__ import annotations
 

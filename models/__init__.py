@@ -1,4 +1,5 @@
-"""Our robot files and the named scenes, one function per scene."""
+"""Our robot files and the named scenes, one function per scene. Imports `loading`, `records` for a scene's metrics, and what lies
+below; it makes no steps."""
 
 from collections.abc import Callable
 

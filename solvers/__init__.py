@@ -1,1 +1,2 @@
-"""Solvers for nonlinear equations and energies: vectors in, vectors out; nothing of the simulator is imported here."""
+"""Solvers for nonlinear equations and energies: vectors in, vectors out. Imports torch only, nothing of ours; `balance` gives it
+problems, and `stepping` composes it."""

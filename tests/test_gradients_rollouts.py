@@ -1,11 +1,9 @@
-"""Derivatives of whole rollouts: closed forms, hard cases, checkpoints, memory, and what has no derivative."""
+"""Derivatives of whole rollouts: closed forms, special points, the same values whatever is asked, checkpoints, memory."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
@@ -14,19 +12,12 @@ from torch.autograd import forward_ad
 
 from pbfd_torch import Simulator
 from pbfd_torch.contact.shapes import Sphere
-from pbfd_torch.errors import GradientError, GradientWarning, InputError
-from pbfd_torch.gradients.implicit import Blur, Doubt, Doubtful, Gradients
-from pbfd_torch.gradients.linearization import Chart
-from pbfd_torch.gradients.linked import Linked, Made, Step, doubts_of
+from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.parameters import parameters, with_parameters
-from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES
 from pbfd_torch.scene import Scene
-from pbfd_torch.schedules.adaptive import AdaptiveSimulator
-from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.objective import Status
-from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
+from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.inertia import Inertia
@@ -35,13 +26,13 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.tree.kinematics import difference
-from tests.bodies import diagonal
+from tests.bodies import GRAVITY, diagonal
 from tests.finite_differences import derivative
 from tests.gradient_checks import precise_solver
 from tests.random_trees import generator
+from tests.sliding_box import stopped
 from tests.touching_bodies import free_bodies, posed
 
-GRAVITY = 9.81
 all_integrators = pytest.mark.parametrize("name", INTEGRATORS)
 
 
@@ -57,17 +48,6 @@ def along(function: Callable[[Tensor], Tensor], largest: float) -> Tensor:
 
 
 # Closed forms ---------------------------------------------------------------------------------------------------------
-
-
-def stopped(v0: Tensor, mu: Tensor, dt: float = 0.01, seconds: float = 0.5) -> Tensor:
-    """How far the box slides from v0 `[m]` with μ `[m]`."""
-    setup = SCENES["box-slide"](worlds=len(v0))
-    scene = with_parameters(setup.scene, {"terms.1.friction.mu": mu[:, None]})
-    simulator = Simulator(scene, dt, solver=precise_solver())
-    v = torch.cat((v0[:, None], setup.v[:, 1:]), -1)
-    path = simulator.trajectory(simulator.initial_state(setup.q, v), steps=round(seconds / dt))
-    assert bool(path.solved.all())
-    return path.q[-1, :, 0] - path.q[0, :, 0]
 
 
 def test_stopping_box() -> None:
@@ -137,105 +117,6 @@ def test_long_horizon() -> None:
     assert bool(torch.isfinite(by_v).all())
     assert float(by_v[0, :3].mean()) == pytest.approx(seconds, rel=1e-6)
     assert float(by_v.norm()) <= 100 * seconds
-
-
-# A hopper under control -----------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Hop:
-    """A hopper that lands and pushes off: float64, and what the end of its motion comes to."""
-
-    simulator: Simulator[Any]
-    start: State
-    controls: Tensor
-    weights: Tensor
-
-    def worth(self, end: State, simulator: Simulator[Any]) -> Tensor:
-        """A number `[*batch]` of a last state."""
-        v = simulator.integrator.velocity(simulator.articulation, end, simulator.step_size)
-        return ((end.q + 0.1 * v) * self.weights.to(end.q.dtype)).sum(-1)
-
-    def reward(self, controls: Tensor) -> Tensor:
-        """What controls `[steps, m, nu]` come to, `[m]`."""
-        many = controls.shape[1]
-        wide = mapped_tensors(self.start, lambda x: x.expand(many, *x.shape[1:]).contiguous())
-        path = self.simulator.trajectory(wide, controls)
-        assert bool(path.solved.all())
-        return self.worth(path.end, self.simulator)
-
-
-@pytest.fixture(scope="module")
-def hop() -> Hop:
-    """32 steps of 8 ms from .16 s after a hopper was let go."""
-    setup = SCENES["hopper"]()
-    simulator = Simulator(setup.scene, 0.008, solver=precise_solver())
-    start = simulator.initial_state(setup.q, setup.v)
-    for _ in range(20):
-        start, _ = simulator.step(start)
-    random = generator(3)
-    controls = 0.4 * torch.randn(32, 1, setup.scene.nu, dtype=torch.float64, generator=random)
-    return Hop(simulator, start, controls, torch.randn(setup.scene.articulation.nv, dtype=torch.float64, generator=random))
-
-
-def by_controls(hop: Hop) -> Tensor:
-    """The exact derivative by all controls."""
-    given = hop.controls.clone().requires_grad_()
-    return torch.autograd.grad(hop.reward(given).sum(), given)[0]
-
-
-def test_hopper_by_all_actions(hop: Hop) -> None:
-    """32 steps with contact: by all 96 actions, each on its own, within 1e-6 of central differences, relative to the largest."""
-    size = hop.controls.numel()
-    steps = 1e-5 * torch.eye(size, dtype=torch.float64)
-    probes = torch.cat((steps, -steps, 2 * steps, -2 * steps)).reshape(4 * size, len(hop.controls), -1).movedim(0, 1)
-    with torch.no_grad():
-        up, down, further_up, further_down = hop.reward(hop.controls + probes).reshape(4, size)
-    expected = ((8 * (up - down) - (further_up - further_down)) / 12e-5).reshape(hop.controls.shape)
-    assert float((by_controls(hop) - expected).abs().max()) <= 1e-6 * float(expected.abs().max())
-
-
-def test_hopper_in_float32(hop: Hop) -> None:
-    """Along the same motion, rounded to float32, the derivative of all 32 steps in a row is within 1e-4 of that in float64. (Two
-    simulations in the two types do not stay together: stiff friction amplifies what is rounded.)"""
-    simulator = Simulator(SCENES["hopper"](dtype=torch.float32).scene, 0.008)
-    states, made = [hop.start], []
-    for control in hop.controls:
-        end, solution, _, way = hop.simulator.made(states[-1], control)
-        states.append(end)
-        made.append(Made(solution, in_dtype(way, torch.float32), doubts_of(solution.status)))
-    states = in_dtype(states, torch.float32)
-    found: list[Tensor] = []
-
-    last, leaves = alive(states[-1])
-    cotangents = list(torch.autograd.grad(hop.worth(last, simulator).sum(), leaves, allow_unused=True, materialize_grads=True))
-    for state, control, step in zip(reversed(states[:-1]), reversed(hop.controls.float()), reversed(made), strict=True):
-        begin, leaves = alive(state)
-        u = control.clone().requires_grad_()
-        end = retraced(simulator, begin, u, step)
-        ends = [x for x in tensors_of(end) if x.is_floating_point()]
-        pairs = [(x, c) for x, c in zip(ends, cotangents, strict=True) if x.requires_grad]
-        given = (*leaves, u)
-        *cotangents, by_u = torch.autograd.grad(
-            [x for x, _ in pairs], given, [c for _, c in pairs], allow_unused=True, materialize_grads=True
-        )
-        found.append(by_u)
-    expected = by_controls(hop)
-    assert float((torch.stack(found[::-1]).double() - expected).abs().max()) <= 1e-4 * float(expected.abs().max())
-
-
-def alive(state: State) -> tuple[State, list[Tensor]]:
-    """The state with leaves of a graph as its numbers, and these."""
-    leaves = [x.detach().clone().requires_grad_(x.is_floating_point()) for x in tensors_of(state)]
-    order = iter(leaves)
-    return mapped_tensors(state, lambda _: next(order)), [x for x in leaves if x.requires_grad]
-
-
-def retraced(simulator: Simulator[Any], state: State, control: Tensor, made: Made) -> Any:
-    """The end of a step that is known, as a function of its state and control."""
-    play = Step(Linked(simulator), state, control)
-    play.made = made
-    return play.again(simulator, state, control)
 
 
 # The same values, whatever is asked of them ---------------------------------------------------------------------------
@@ -323,132 +204,6 @@ def test_nothing_but_states_is_kept() -> None:
     assert kept[10] <= 0.2 * state
 
 
-# What has no derivative -----------------------------------------------------------------------------------------------
-
-
-def stuck(policy: Doubtful) -> tuple[Any, Tensor]:
-    """Two steps of two worlds that land, the second of which a solver of few evaluations does not solve."""
-    setup = SCENES["chain-slope-drop"](worlds=2)
-    q = setup.q.clone()
-    q[0, 2] += 5.0  # the first one is still in free fall
-    simulator = Simulator(
-        setup.scene, 0.05, INTEGRATORS["implicit-euler"](), Descent(max_evaluations=2), halvings=0, gradients=Gradients(policy)
-    )
-    v = setup.v.clone().requires_grad_()
-    return simulator.trajectory(simulator.initial_state(q, v), steps=6), v
-
-
-def test_unsolved_steps_are_not_differentiated_silently() -> None:
-    """They raise, with where and how many; or warn; or give zero, the other world's derivative being untouched; always flagged."""
-    path, v = stuck(Doubtful.RAISE)
-    assert path.solved[:, 0].all()
-    assert not path.solved[:, 1].all()
-    assert torch.equal((path.doubts & int(Doubt.UNSOLVED)) > 0, ~path.solved)
-    with pytest.raises(GradientError, match=r"unsolved in 1 of 2 worlds.*Doubtful\.WARN or ZERO"):
-        path.q[-1].sum().backward()
-    path, v = stuck(Doubtful.WARN)
-    with pytest.warns(GradientWarning, match="unsolved in 1 of 2 worlds"):
-        path.q[-1].sum().backward()
-    assert v.grad is not None
-    warned = v.grad
-    path, v = stuck(Doubtful.ZERO)
-    path.q[-1].sum().backward()
-    assert v.grad is not None
-    torch.testing.assert_close(v.grad[0], warned[0], rtol=1e-12, atol=0)
-    assert not v.grad[1].any()
-
-
-def standing(policy: Doubtful) -> tuple[Simulator[Any], Tensor]:
-    """A pendulum that stands on its head at Δt = √(I/(m g l)), where J = I/Δt² − m g l vanishes."""
-    mass, length, inertia = 1.0, 0.5, 0.02
-    joint = Joint("hinge", JointKind.HINGE, axis=(0.0, 1.0, 0.0))
-    a = Articulation.from_links(
-        [Link("rod", joints=(joint,), mass=mass, com=(0.0, 0.0, length), inertia=diagonal(inertia, inertia, inertia))]
-    )
-    scene = Scene(a, (Inertia(),), torch.tensor([0.0, 0.0, -GRAVITY], dtype=torch.float64))
-    dt = math.sqrt((inertia + mass * length**2) / (mass * GRAVITY * length))
-    simulator = Simulator(scene, dt, INTEGRATORS["implicit-euler"](), gradients=Gradients(policy))
-    return simulator, torch.zeros(1, 1, dtype=torch.float64)
-
-
-def test_singular_steps_are_damped_and_reported() -> None:
-    """At a fold J has no inverse: the derivative is damped, finite, flagged and reported as the policy says."""
-    for policy in Doubtful:
-        simulator, zero = standing(policy)
-        start = simulator.initial_state(zero, zero)
-        q = start.q.clone().requires_grad_()
-        path = simulator.trajectory(replaced(start, q=q), steps=1)
-        assert bool(path.solved.all())
-        if policy is Doubtful.RAISE:
-            with pytest.raises(GradientError, match="singular in 1 of 1 worlds"):
-                path.q[-1].sum().backward()
-        elif policy is Doubtful.WARN:
-            with pytest.warns(GradientWarning, match="singular in 1 of 1 worlds"):
-                path.q[-1].sum().backward()
-            assert q.grad is not None
-            assert bool(torch.isfinite(q.grad).all())
-        else:
-            path.q[-1].sum().backward()
-            assert q.grad is not None
-            assert float(q.grad) == 0
-        assert bool((path.doubts & int(Doubt.SINGULAR)).all())
-
-
-def test_other_ways_are_flagged() -> None:
-    """Eased and halved steps have exact derivatives, and say so."""
-    setup = SCENES["chain-slope-drop"]()
-    simulator = Simulator(setup.scene, 0.1)
-    path = simulator.trajectory(simulator.initial_state(setup.q, setup.v), steps=12)
-    detour = (path.status == int(Status.EASED)) | (path.status == int(Status.HALVED))
-    assert bool(detour.any())
-    assert torch.equal((path.doubts & int(Doubt.DETOUR)) > 0, detour)
-
-
-def test_no_second_derivatives() -> None:
-    """Asked for a second derivative, a step raises instead of giving half of it."""
-    v0 = torch.ones(1, dtype=torch.float64, requires_grad=True)
-    distance = stopped(v0, torch.full((1,), 0.3, dtype=torch.float64), seconds=0.02).sum()
-    with pytest.raises(GradientError, match="first derivatives only"):
-        torch.autograd.grad(distance, v0, create_graph=True)
-
-
-def test_adaptive_steps_refuse() -> None:
-    """Steps of their own choice carry no derivatives: a message, not a wrong number."""
-    setup = SCENES["chain-fixed"]()
-    simulator = AdaptiveSimulator(setup.scene, 0.05, 1e-3)
-    start = simulator.initial_state(setup.q, setup.v)
-    with pytest.raises(InputError, match="carry no derivatives"):
-        simulator.step(replaced(start, v=start.v.clone().requires_grad_()))
-    with pytest.raises(InputError, match="has rollouts only"):
-        simulator.trajectory(start, steps=2)
-
-
-def test_blurred_contact_is_felt_from_afar() -> None:
-    """A ball above the ground knows nothing of it; blurred derivatives do, values being the same. They are biased, and so say the
-    docs."""
-    scene = free_bodies((Sphere(0.1),), (1.0,))
-    q, v = posed((0.0, 0.0, 0.105)), torch.zeros(1, 6, dtype=torch.float64)
-    found, ends = [], []
-    for gradients in (Gradients(), Gradients(blur=Blur(widening=10.0, distance=5e-3))):
-        simulator = Simulator(scene, 0.01, gradients=gradients)
-        given = q.clone().requires_grad_()
-        path = simulator.trajectory(simulator.initial_state(given, v), steps=1)
-        ends.append(path.q)
-        found.append(float(torch.autograd.grad(path.q[-1, 0, 2], given)[0][0, 2]))
-    assert torch.equal(ends[0], ends[1])
-    assert found[0] == pytest.approx(1.0, abs=1e-12)
-    assert 0 < found[1] < 0.9
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"), [({"widening": 0.5}, "widening is 0.5"), ({"distance": -1.0}, "distance is -1.0 m")]
-)
-def test_bad_blurs(changes: dict[str, float], message: str) -> None:
-    """Refused at construction."""
-    with pytest.raises(InputError, match=message):
-        Blur(**changes)
-
-
 def test_kept_factors_give_the_same() -> None:
     """Factors that are kept serve further derivatives of the same trajectory, to the bit."""
     setup = SCENES["chain-slope-drop"]()
@@ -501,35 +256,3 @@ def test_special_points(point: str) -> None:
     sides = one_sided(lambda h: float(end(h * unit)))
     assert bool(torch.isfinite(found).all())
     assert min(abs(float(found[0, coordinate]) - side) for side in sides) <= 1e-4 * max(1e-2, *map(abs, sides))
-
-
-# Linear systems -------------------------------------------------------------------------------------------------------
-
-
-@all_integrators
-def test_linearisation(name: str) -> None:
-    """A and B of a hopper's steps predict perturbed steps, with an error that shrinks as h² until rounding, in every world."""
-    setup = SCENES["hopper"](worlds=2)
-    simulator = Simulator(setup.scene, 0.008, INTEGRATORS[name](), precise_solver())
-    random = generator(2)
-    state = simulator.initial_state(setup.q, setup.v)
-    for _ in range(5):
-        control = 0.3 * torch.randn(2, setup.scene.nu, dtype=torch.float64, generator=random)
-        state, _ = simulator.step(state, control)
-    system = simulator.linearize(state, control)
-    before, after = Chart(simulator, state), Chart(simulator, system.end)
-    assert system.A.shape == (2, after.size, before.size)
-    assert system.B.shape == (2, after.size, setup.scene.nu)
-    step = torch.randn(2, before.size, dtype=torch.float64, generator=random)
-    for part, place in before.layout.items():
-        if part != "v":
-            step[:, place] *= 0.01
-    du = torch.randn(2, setup.scene.nu, dtype=torch.float64, generator=random)
-    expected = (system.A @ step[..., None] + system.B @ du[..., None]).squeeze(-1)
-
-    def off(h: float) -> float:
-        ends = [after.of(simulator.step(before.at(s * step), control + s * du)[0]) for s in (h, -h)]
-        return float(((ends[0] - ends[1]) / (2 * h) - expected).abs().max() / expected.abs().max())
-
-    assert off(1e-4) <= 1e-6
-    assert off(2e-4) / off(1e-4) == pytest.approx(4, rel=0.2) or off(1e-4) <= 1e-9

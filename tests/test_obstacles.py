@@ -26,11 +26,12 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.tree.kinematics import place, retract
 from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
+from tests.body_on_plane import contact_points, one_body, pose
 from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import generator
 from tests.states import state_of
 from tests.term_cases import QUICK, ROUND, SLIDING, STICKING, Situation, colliders_of, no_load, situation
-from tests.test_terms import contact_points, moved_scene, one_body, pose
+from tests.test_terms import moved_scene
 
 TIME = 0.7  # at the start of the step: a moving solid is not where it was put
 HULL = ConvexHull(0.8 * torch.randn(12, 3, dtype=torch.float64, generator=generator(5)).numpy())

@@ -19,10 +19,10 @@ from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.tree.kinematics import Motion, place
 from tests.random_trees import SEEDS
+from tests.solver_points import Point
 from tests.solver_problems import FunctionObjective
 from tests.states import implicit
 from tests.term_cases import CONTACTS, TERMS, Situation, TermCase, situation
-from tests.test_globalisation import Point
 from tests.test_kinematics import tangent
 
 all_terms = pytest.mark.parametrize("case", TERMS, ids=str)

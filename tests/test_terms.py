@@ -1,4 +1,4 @@
-"""Every term: exact Jacobians, energies, invariance, worlds apart; and the closed forms of contact, friction and actuators."""
+"""Every term: exact Jacobians, energies, no load where there is nothing, invariance, worlds apart."""
 
 from __future__ import annotations
 
@@ -10,28 +10,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.balance.assembly import Balance
-from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Point
 from pbfd_torch.contact.surface import Plane
-from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.terms.actuators import Actuator, Actuators
-from pbfd_torch.terms.contact import Contact, ContactPoints
-from pbfd_torch.terms.coulomb_friction import CoulombFriction, slip_factor, slip_factor_slope
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
-from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
-from pbfd_torch.terms.joint_springs import JointDamping, JointSprings, checked_coefficient
-from pbfd_torch.terms.load import LinkLoad, Term
-from pbfd_torch.terms.normal_force import NormalForce, power
+from pbfd_torch.terms.joint_springs import JointSprings
+from pbfd_torch.terms.load import Term
+from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.pushes import Pushes
-from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link, homogeneous
+from pbfd_torch.tree.articulation import homogeneous
 from pbfd_torch.tree.kinematics import place, retract
 from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix, quaternion_multiply
-from tests.finite_differences import derivative, jacobian, relative_error
+from tests.finite_differences import jacobian, relative_error
 from tests.random_trees import SEEDS
 from tests.states import state_of
 from tests.term_cases import CONTACTS, ROUND, SLIDING, STICKING, TERMS, Situation, TermCase, contact, raised, situation
@@ -136,6 +130,19 @@ def test_stiffness_of_conservative_terms_is_symmetric_and_never_pulls(case: Term
         size = float(stiffness.abs().max())
         assert float((stiffness - stiffness.mT).abs().max()) <= 1e-12 * size
         assert float(torch.linalg.eigvalsh(0.5 * (stiffness + stiffness.mT)).min()) >= -1e-12 * size
+
+
+def test_softened_contact_and_limits() -> None:
+    """softened(f) scales force, stiffness and energy by f, of contacts (Coulomb friction follows) and of limits."""
+    s = situation(0, (2,))
+    for case in TERMS:
+        term = case.build(s)
+        if case.name not in ("contact, α = 2", "Coulomb, sliding", "joint limits"):
+            continue
+        assert isinstance(term, (Contact, JointLimits))
+        full, soft = s.balance([term], s.q), s.balance([term.softened(0.01)], s.q)
+        torch.testing.assert_close(soft.residual, 0.01 * full.residual, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(soft.jacobian, 0.01 * full.jacobian, rtol=1e-12, atol=1e-9)
 
 
 # Where there is nothing, there is nothing -----------------------------------------------------------------------------
@@ -313,306 +320,3 @@ def test_contact_parameters_may_differ_from_world_to_world(friction: type) -> No
         alone = one.balance([Inertia(), one_made], one.q)
         torch.testing.assert_close(whole.residual[k], alone.residual, rtol=1e-12, atol=1e-10)
         torch.testing.assert_close(whole.jacobian[k], alone.jacobian, rtol=1e-12, atol=1e-9)
-
-
-# Closed forms: the normal force ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("exponent", [1.5, 2.0, 2.5, 3.0])
-def test_normal_force_carries_a_load_at_its_rest_depth(exponent: float) -> None:
-    """f(d) = N at d = (N/C⊥)^{1/α} (METHOD §4); df/dd = α C⊥ d^{α−1}; f = d/dd of the energy C⊥ d^{α+1}/(α+1)."""
-    law = NormalForce(3e6, exponent)
-    load = torch.tensor([0.1, 9.81, 500.0], dtype=torch.float64)
-    depth = (load / 3e6) ** (1 / exponent)
-    push, slope = law.force(depth)
-    torch.testing.assert_close(push, load, rtol=1e-13, atol=0)
-    torch.testing.assert_close(slope, exponent * load / depth, rtol=1e-13, atol=0)
-    d = depth.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(law.energy(d).sum(), d)
-    torch.testing.assert_close(gradient, load, rtol=1e-12, atol=0)
-
-
-def test_normal_force_for_weight() -> None:
-    """`for_weight` makes a load W rest at the depth asked for: C⊥ = W/d^α."""
-    push, _ = NormalForce.for_weight(20.0, 5e-4, 2.5).force(torch.tensor([5e-4], dtype=torch.float64))
-    assert float(push) == pytest.approx(20.0, rel=1e-13)
-
-
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0, 2.5, 3.0, 4.0, 5.0])
-def test_power(exponent: float) -> None:
-    """base^e for base ≥ 0, with 0^0 = 1 and 0^e = 0, in one world as in many; its gradient is e base^{e−1}."""
-    base = torch.tensor([0.0, 1e-9, 0.3, 1.0, 7.0], dtype=torch.float64)
-    expected = [x**exponent for x in base.tolist()]
-    torch.testing.assert_close(power(base, exponent), torch.tensor(expected, dtype=torch.float64), rtol=1e-13, atol=0)
-    assert all(torch.equal(power(base[k], exponent), power(base, exponent)[k]) for k in range(5))
-    x = base[1:].clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(power(x, exponent).sum(), x) if exponent else (torch.zeros(4, dtype=torch.float64),)
-    torch.testing.assert_close(gradient, exponent * base[1:] ** (exponent - 1), rtol=1e-12, atol=0)
-
-
-def test_softened_contact_and_limits() -> None:
-    """softened(f) scales force, stiffness and energy by f, of contacts (Coulomb friction follows) and of limits."""
-    s = situation(0, (2,))
-    for case in TERMS:
-        term = case.build(s)
-        if case.name not in ("contact, α = 2", "Coulomb, sliding", "joint limits"):
-            continue
-        assert isinstance(term, (Contact, JointLimits))
-        full, soft = s.balance([term], s.q), s.balance([term.softened(0.01)], s.q)
-        torch.testing.assert_close(soft.residual, 0.01 * full.residual, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(soft.jacobian, 0.01 * full.jacobian, rtol=1e-12, atol=1e-9)
-
-
-# Closed forms: one body on a plane ------------------------------------------------------------------------------------
-
-
-def one_body(
-    shape: Shape, friction: FrictionLaw | None, stiffness: float = 1e6, margin: float = 0.0
-) -> tuple[Articulation, Contact]:
-    """A free body of 1 kg with one collider at its origin, on the plane z = 0."""
-    eye = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
-    articulation = Articulation.from_links([Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.0, inertia=eye)])
-    colliders = [Collider("c", "body", shape, margin=margin)]
-    return articulation, Contact.between(articulation, colliders, HalfSpace(), NormalForce(stiffness), friction)
-
-
-def contact_points(
-    articulation: Articulation, made: Contact, before: Tensor, after: Tensor, dt: float
-) -> tuple[ContactPoints, LinkLoad]:
-    """What the contact sees over a step from one configuration to the next."""
-    time = torch.tensor(dt, dtype=torch.float64)
-    gravity = torch.zeros(3, dtype=torch.float64)
-    prepared = made.prepare(ImplicitEuler().context(articulation, state_of(before, before), time, gravity, None))
-    placement = place(articulation, after)
-    return made.points(prepared, placement), made.load(prepared, placement)
-
-
-def pose(position: tuple[float, float, float], turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Tensor:
-    return torch.cat((torch.tensor(position, dtype=torch.float64), quaternion_exp(torch.tensor(turn, dtype=torch.float64))))
-
-
-@pytest.mark.parametrize(("speed", "share"), [(0.5, 1.0), (1e-3, 1.0), (5e-4, 0.75), (1e-4, 0.19), (0.0, 0.0)])
-def test_coulomb_force(speed: float, share: float) -> None:
-    """f∥ = −μ N s(‖u‖) u: of size μN against the slip from ε_v = 1 mm/s on, and (2 − y)y μN at y = v/ε_v below; N = C⊥ d²."""
-    articulation, made = one_body(Point(), CoulombFriction(0.4, 1e-3))
-    direction = torch.tensor([0.6, -0.8, 0.0], dtype=torch.float64)
-    dt, depth = 0.01, 2e-3
-    after = pose((0.0, 0.0, -depth))
-    after[:3] += speed * dt * direction
-    points, load = contact_points(articulation, made, pose((0.0, 0.0, -depth)), after, dt)
-    normal = 1e6 * depth**2
-    expected = torch.tensor([0.0, 0.0, normal], dtype=torch.float64) - 0.4 * normal * share * direction
-    torch.testing.assert_close(points.force[0], expected, rtol=0, atol=1e-9 * normal)
-    torch.testing.assert_close(-load.moment[0, :, 3], expected, rtol=0, atol=1e-9 * normal)
-
-
-def test_slip_factor_is_smooth() -> None:
-    """s·y rises from 0 to 1 at y = w with slope 2/w at 0 and 0 at w, and stays 1: both s and its slope are continuous at w."""
-    width = torch.tensor(1e-3, dtype=torch.float64)
-    eps = 1e-9
-    below, above = width * (1 - eps), width * (1 + eps)
-    assert float(slip_factor(below, width) * width) == pytest.approx(1.0, abs=1e-8)
-    for function in (slip_factor, slip_factor_slope):
-        assert float(function(below, width)) == pytest.approx(float(function(above, width)), rel=1e-8)
-    y = torch.linspace(0.0, 3e-3, 301, dtype=torch.float64)
-    force = slip_factor(y, width) * y
-    assert bool((force.diff() >= -1e-12).all())
-    assert float(force[0]) == 0
-    assert float(force[1:2] / y[1:2]) == pytest.approx(2 / 1e-3, rel=1e-2)
-    assert float((force[y >= 1e-3] - 1).abs().max()) <= 1e-12
-
-
-@pytest.mark.parametrize("beta", [1.0, 1.5, 2.0])
-@pytest.mark.parametrize("printed", [True, False], ids=["as printed", "as derived"])
-def test_pbfd_friction_is_coulombs_with_a_calibrated_mu(beta: float, printed: bool) -> None:
-    """With α = 2, γ = 1: f∥ = −μ_eff N u/‖u‖, μ_eff = (β + 1)(C∥/C⊥)(v Δt)^{β+1} as printed, ^β as derived, at any depth."""
-    tangential, normal_stiffness, dt, speed = 4e5, 1e6, 0.02, 0.7
-    law = (PbfdFriction.as_printed if printed else PbfdFriction.as_derived)(tangential, beta, 1.0)
-    articulation, made = one_body(Point(), law, normal_stiffness)
-    mu = (beta + 1) * tangential / normal_stiffness * (speed * dt) ** (beta + 1 if printed else beta)
-    for depth in (1e-4, 1e-3, 1e-2):
-        points, _ = contact_points(articulation, made, pose((0.0, 0.0, 0.0)), pose((speed * dt, 0.0, -depth)), dt)
-        normal = normal_stiffness * depth**2
-        assert float(points.force[0, 2]) == pytest.approx(normal, rel=1e-12)
-        assert float(points.force[0, 0]) == pytest.approx(-mu * normal, rel=1e-12)
-
-
-@pytest.mark.parametrize("beta", [1.0, 2.0])
-@pytest.mark.parametrize("printed", [True, False], ids=["as printed", "as derived"])
-def test_calibrated_friction_brakes_with_mu(beta: float, printed: bool) -> None:
-    """`calibrated(μ, C⊥, v, Δt)`: at slip v Δt the law brakes with μN exactly, at any depth."""
-    law = (PbfdFriction.as_printed if printed else PbfdFriction.as_derived)(1.0, beta, 1.0).calibrated(0.35, 1e6, 0.7, 0.02)
-    articulation, made = one_body(Point(), law, 1e6)
-    for depth in (1e-4, 1e-2):
-        points, _ = contact_points(articulation, made, pose((0.0, 0.0, 0.0)), pose((0.0, 0.7 * 0.02, -depth)), 0.02)
-        assert float(points.force[0, 1]) == pytest.approx(-0.35 * 1e6 * depth**2, rel=1e-12)
-
-
-@pytest.mark.parametrize("angle", [1e-6, 0.01, 0.5, 2.0, 3.1])
-@pytest.mark.parametrize("direction", [0.0, 0.8])
-def test_pure_rolling_does_not_slip(angle: float, direction: float) -> None:
-    """A sphere that turns by φ while its centre moves by φ × ρ n has u = 0 at every angle φ < π, where the chord has Rφ³/6;
-    and so does every sphere of a capsule that rolls across its axis."""
-    radius, depth = 0.05, 1e-3
-    axis = (-math.sin(direction), math.cos(direction), 0.0)
-    turn = (angle * axis[0], angle * axis[1], 0.0)
-    for start in ((0.0, 0.0, 0.0), (0.3, 1.0, -0.2)):
-        articulation, made = one_body(Sphere(radius), CoulombFriction(0.5))
-        before = pose((1.0, 2.0, radius - depth), start)
-        after = before.clone()
-        after[0] += radius * angle * math.cos(direction)
-        after[1] += radius * angle * math.sin(direction)
-        after[3:] = quaternion_multiply(quaternion_exp(torch.tensor(turn, dtype=torch.float64)), before[3:])
-        points, _ = contact_points(articulation, made, before, after, 0.01)
-        assert float(points.depth) == pytest.approx(depth, rel=1e-9)
-        assert float(points.slip.abs().max()) <= 1e-14
-        assert float(points.force[0, :2].abs().max()) <= 1e-9
-    articulation, made = one_body(Capsule(radius, 0.2), CoulombFriction(0.5))
-    lying = quaternion_exp(0.5 * math.pi * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))  # its axis along −y
-    before = torch.cat((torch.tensor([0.0, 0.0, radius - depth], dtype=torch.float64), lying))
-    after = before.clone()
-    after[0] += radius * angle
-    after[3:] = quaternion_multiply(quaternion_exp(torch.tensor([0.0, angle, 0.0], dtype=torch.float64)), lying)
-    points, _ = contact_points(articulation, made, before, after, 0.01)
-    assert points.slip.shape == (2, 3)
-    assert float(points.slip.abs().max()) <= 1e-14
-
-
-def test_spinning_in_place_slips() -> None:
-    """A sphere that turns by φ about y without moving slips by u = −ρ φ × n = −ρφ x: the surface point runs backwards."""
-    articulation, made = one_body(Sphere(0.05), CoulombFriction(0.5))
-    points, _ = contact_points(articulation, made, pose((0, 0, 0.049)), pose((0, 0, 0.049), (0.0, 0.3, 0.0)), 0.01)
-    torch.testing.assert_close(points.slip[0], torch.tensor([-0.015, 0.0, 0.0], dtype=torch.float64), rtol=0, atol=1e-15)
-
-
-def test_force_acts_at_the_surface() -> None:
-    """Friction of a sphere acts at c − ρn: its moment about the centre is (−ρ n) × f; a point with a margin feels it itself."""
-    for shape, margin, lever in ((Sphere(0.05), 0.0, 0.05), (Point(), 0.05, 0.0)):
-        articulation, made = one_body(shape, CoulombFriction(0.5), margin=margin)
-        before = pose((0.4, -0.3, 0.049))
-        after = before.clone()
-        after[0] += 0.01
-        points, load = contact_points(articulation, made, before, after, 0.01)
-        residual = Balance(place(articulation, after), [load]).residual
-        force = points.force[0]
-        arm = torch.tensor([0.0, 0.0, -lever], dtype=torch.float64)
-        torch.testing.assert_close(residual[:3], -force, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(residual[3:], -torch.linalg.cross(arm, force), rtol=1e-12, atol=1e-12)
-        assert float(force[0]) == pytest.approx(-0.5 * float(force[2]), rel=1e-12)
-
-
-# Closed forms: joints -------------------------------------------------------------------------------------------------
-
-
-def test_joint_limit_torque() -> None:
-    """Torque −k x² back into the range at a violation x; energy k x³/3; a load τ rests √(τ/k) past the limit."""
-    s = situation(0)
-    a = s.articulation
-    k = torch.full((a.nv,), 40.0, dtype=torch.float64)
-    limits = JointLimits(k, math.inf)
-    residual = limits.load(limits.prepare(s.context(s.q)), place(a, s.q)).residual
-    x = s.q[a.topology.scalar_q]
-    lower, upper = a.lower[a.topology.scalar_v], a.upper[a.topology.scalar_v]
-    expected = 40.0 * ((x - upper).clamp_min(0) ** 2 - (lower - x).clamp_min(0) ** 2)
-    torch.testing.assert_close(residual[a.topology.scalar_v], expected, rtol=1e-12, atol=1e-12)
-    others = torch.cat((a.topology.free_v.flatten(), a.topology.turning_v.flatten()))
-    assert bool((residual[others] == 0).all())
-
-
-def test_dry_friction_torque() -> None:
-    """Torque of size τ against the motion once |q̇| ≥ slip_speed; (2 − y) y τ at y = |q̇|/slip_speed below."""
-    s = situation(0)
-    a = s.articulation
-    torque = torch.zeros(a.nv, dtype=torch.float64)
-    torque[a.topology.scalar_v] = 2.0
-    for y, share in ((3.0, 1.0), (1.0, 1.0), (0.5, 0.75), (-0.5, -0.75), (-3.0, -1.0)):
-        q = s.state.q.clone()
-        q[a.topology.scalar_q] += y * 0.1 * float(s.dt)
-        residual = s.balance([JointDryFriction(torque, slip_speed=0.1)], q).residual
-        expected = torch.full((len(a.topology.scalar_v),), 2.0 * share, dtype=torch.float64)
-        torch.testing.assert_close(residual[a.topology.scalar_v], expected, rtol=1e-9, atol=1e-9)
-
-
-def test_actuator_forces() -> None:
-    """Force gear · clamp(gain·u + bias − kp·x − kv·ẋ, effort) at x = gear·q, control clamped to its range; several actuators on one
-    joint add up."""
-    s = situation(0)
-    a = s.articulation
-    name = a.joint_names[int(a.topology.scalar_joint[0])]
-    column, row = int(a.topology.scalar_q[0]), int(a.topology.scalar_v[0])
-    dt, gear, u = float(s.dt), 1.5, 0.9
-    x = gear * float(s.q[column])
-    rate = (x - gear * float(s.state.q[column])) / dt
-
-    def force(*made: Actuator) -> float:
-        bank = Actuators.from_list(a, list(made))
-        one = dataclasses.replace(s, control=torch.full((len(made),), u, dtype=torch.float64))
-        residual = one.balance([bank], one.q).residual
-        assert int((residual != 0).sum()) <= 1
-        return -float(residual[row])
-
-    assert force(Actuator.motor("m", name, gear)) == pytest.approx(gear * u, rel=1e-12)
-    assert force(Actuator.motor("m", name, gear, effort=0.5)) == pytest.approx(gear * 0.5, rel=1e-12)
-    expected = 20 * (u - x) - 3 * rate
-    position = Actuator("p", name, gear, gain=20, stiffness=20, damping=3)
-    assert force(position) == pytest.approx(gear * expected, rel=1e-12)
-    limited = dataclasses.replace(position, force_range=(-0.01, 0.02))
-    assert force(limited) == pytest.approx(gear * (0.02 if expected > 0 else -0.01), rel=1e-12)
-    assert force(Actuator("v", name, gear, gain=3, damping=3)) == pytest.approx(gear * 3 * (u - rate), rel=1e-12)
-    assert force(Actuator("c", name, gear, control_range=(-0.2, 0.2))) == pytest.approx(gear * 0.2, rel=1e-12)
-    assert force(Actuator("b", name, gear, bias=-0.4)) == pytest.approx(gear * (u - 0.4), rel=1e-12)
-    both = force(position, Actuator.motor("m", name, gear))
-    assert both == pytest.approx(gear * (expected + u), rel=1e-12)
-
-
-def test_actuators_without_control_get_zero() -> None:
-    """control None is u = 0: a motor gives nothing, a position servo pulls to x = 0."""
-    s = situation(0)
-    a = s.articulation
-    name, column = a.joint_names[int(a.topology.scalar_joint[0])], int(a.topology.scalar_q[0])
-    bank = Actuators.from_list(a, [Actuator.motor("m", name), Actuator.position("p", name, kp=5.0)])
-    residual = dataclasses.replace(s, control=None).balance([bank], s.q).residual
-    assert float(residual[a.topology.scalar_v[0]]) == pytest.approx(5.0 * float(s.q[column]), rel=1e-12)
-
-
-def test_damping_of_a_free_spin() -> None:
-    """Damping of a ball or free joint: torque −c ω for the average angular velocity ω = log(R_nᵀR)/Δt about the body's axes."""
-    articulation, _ = one_body(Point(), None)
-    s = dataclasses.replace(situation(0), articulation=articulation)
-    before = pose((0.0, 0.0, 0.0), (0.2, -0.1, 0.5))
-    step = torch.tensor([0.1, 0.0, -0.2, 0.3, -0.4, 0.2], dtype=torch.float64)
-    after = retract(articulation, before, step)
-    moving = dataclasses.replace(s, state=state_of(before, before), q=after, control=None)
-    damping = torch.tensor([2.0, 2.0, 2.0, 0.5, 0.5, 0.5], dtype=torch.float64)
-    residual = moving.balance([JointDamping(damping)], after).residual
-    torch.testing.assert_close(residual, damping * step / float(s.dt), rtol=1e-12, atol=1e-12)
-
-
-# Bad parameters -------------------------------------------------------------------------------------------------------
-
-
-def test_joint_coefficients_are_checked() -> None:
-    """One number per degree of freedom, finite, ≥ 0, equal about the axes of one rotation; the message says which value failed."""
-    a = situation(0).articulation
-    good = torch.ones(a.nv, dtype=torch.float64)
-    assert torch.equal(checked_coefficient(a, good, "damping"), good)
-    uneven = good.clone()
-    uneven[a.topology.turning_v[0, 1]] = 2.0
-    for bad, words in ((good[:-1], "shape"), (-good, "≥ 0"), (good * math.nan, "finite"), (uneven, "rotation axes")):
-        with pytest.raises(InputError, match=words):
-            checked_coefficient(a, bad, "damping")
-
-
-def test_derivative_of_a_known_function() -> None:
-    """The checker itself: ∂ sin(x)/∂x = cos(x) to 1e-11, and with a kink 3e-4 away from the point as well."""
-    x = torch.tensor([0.3, -1.2], dtype=torch.float64)
-
-    def smooth(delta: Tensor) -> Tensor:
-        return torch.sin(5 * (x + delta))
-
-    def kinked(delta: Tensor) -> Tensor:
-        return torch.sin(5 * (x + delta)) + (delta - 3e-4).clamp_min(0)
-
-    expected = torch.diag(5 * torch.cos(5 * x))
-    assert float((derivative(smooth, 2) - expected).abs().max()) <= 1e-11
-    assert float((derivative(kinked, 2) - expected).abs().max()) <= 1e-9

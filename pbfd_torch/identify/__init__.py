@@ -1,4 +1,4 @@
-"""System identification: physical parameters from measured motion."""
+"""System identification: physical parameters from measured motion. Built on the simulator's trajectories."""
 
 from pbfd_torch.identify.case import Case
 from pbfd_torch.identify.certainty import Certainty, certainty

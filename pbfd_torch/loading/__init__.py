@@ -1,4 +1,5 @@
-"""Robot files in: URDF and MJCF."""
+"""Robot files in: URDF and MJCF become a scene. Imports `scene`, `terms`, `contact`, `looks` and what lies below; it makes no
+steps."""
 
 from __future__ import annotations
 

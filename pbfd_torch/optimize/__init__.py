@@ -1,4 +1,5 @@
-"""Trajectory optimisation: shooting by torch's optimisers or Gauss–Newton, and iLQR with control limits."""
+"""Trajectory optimisation: shooting by torch's optimisers or Gauss–Newton, and iLQR with control limits. Built on the simulator's
+trajectories and linearisations; it shares its least squares with `identify`."""
 
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Stopping
 from pbfd_torch.optimize.backward_pass import Policy

@@ -1,4 +1,5 @@
-"""Looks at rollouts: in a browser, as a page, a still or a film. Draws, never steps, but for `live`."""
+"""Looks at rollouts: in a browser, as a page, a still or a film. Draws, never steps, but for `live`. Imports `records` and the
+simulator; `show` is its door."""
 
 from __future__ import annotations
 
