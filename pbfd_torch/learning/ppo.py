@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
-import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -19,37 +17,36 @@ from torchrl.objectives.value import GAE
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.learning import curve
-from pbfd_torch.learning.folder import Folder
-from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
-from pbfd_torch.learning.training_env import EnvSettings, check, plain, statistics, training_env
+from pbfd_torch.learning.networks import SEEN
+from pbfd_torch.learning.settings import Settings
+from pbfd_torch.learning.trainer import Progress, Trainer
+from pbfd_torch.learning.training_env import training_env
 
 
-@dataclass(frozen=True)
-class Ppo:
+@dataclass(frozen=True, kw_only=True)
+class Ppo(Settings):
     """Attributes:
-    env: where.
-    horizon: steps of each world per batch. epochs, minibatch: of the updates.
-    learning_rate: falling to a tenth over `decay` environment steps, and staying there.
-    gamma, lmbda, clip, entropy, width: the usual ones; width: of both networks' two hidden layers.
+    minibatch, learning_rate, clip, entropy: the usual ones.
     workers: processes that collect, each with `env.num_envs` worlds. ray: remote collectors instead, on one machine or many.
+
+    See `Settings` for the others.
     """
 
-    env: EnvSettings
+    counts: ClassVar[tuple[str, ...]] = (*Settings.counts, "minibatch", "workers")
+
     horizon: int = 32
     epochs: int = 10
-    minibatch: int = 64
-    learning_rate: float = 3e-4
     decay: int = 400_000
     gamma: float = 0.995
-    lmbda: float = 0.95
+    minibatch: int = 64
+    learning_rate: float = 3e-4
     clip: float = 0.2
     entropy: float = 0.0
-    width: int = 64
     workers: int = 1
     ray: int = 0
 
     def __post_init__(self) -> None:
-        check(self.gamma, {name: getattr(self, name) for name in ("horizon", "epochs", "minibatch", "decay", "width", "workers")})
+        super().__post_init__()
         if self.ray < 0 or (self.ray and self.workers > 1):
             raise InputError(f"ray is {self.ray} and workers {self.workers}: give one of the two")
 
@@ -58,37 +55,20 @@ class Ppo:
         return self.env.num_envs * self.horizon * max(self.workers, self.ray)
 
 
-class PpoTrainer:
-    """Trains into a folder, see `Folder`.
+class PpoTrainer(Trainer[Ppo]):
+    """See `Trainer`. Its own world is a probe: what collects has others."""
 
-    A folder that holds a checkpoint is gone on with where `resume` is set, and refused otherwise. What was learnt, the optimiser,
-    the statistics and the curve go on where they were; episodes under way begin anew."""
+    method = "PPO"
 
     def __init__(self, settings: Ppo, path: Path, resume: bool = False) -> None:
-        torch.manual_seed(settings.env.seed)
-        self.folder, self.settings = Folder(path, "PPO", settings.env.name, resume), settings
-        probe = settings.env.make(num_envs=1)
-        width = probe.observation_spec["observation"].shape[-1]
-        self.actor = make_actor(width, probe.action_spec, settings.width)
-        self.critic = make_critic(width, settings.width)
+        super().__init__(settings, path, resume, worlds=1)
         self.advantage = GAE(gamma=settings.gamma, lmbda=settings.lmbda, value_network=self.critic, average_gae=False)
         self.loss = ClipPPOLoss(
             self.actor, self.critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy, normalize_advantage=True
         )
         self.optimiser = torch.optim.Adam(self.loss.parameters(), settings.learning_rate, eps=1e-5)
-        self._memory = tempfile.TemporaryDirectory(prefix="pbfd-statistics-")
-        self.shared = statistics(settings.env, Path(self._memory.name))
-        if self.folder.saved is not None:
-            self._restore(self.folder.saved)
-
-    def _restore(self, saved: dict[str, Any]) -> None:
-        self.actor.load_state_dict(saved["actor"])
-        self.critic.load_state_dict(saved["critic"])
-        self.optimiser.load_state_dict(saved["optimiser"])
-        self.shared.update_(saved["statistics"])
-        # other starts than those that have been
-        fresh = replace(self.settings.env, seed=self.settings.env.seed + len(self.folder.rows))
-        self.settings = replace(self.settings, env=fresh)
+        self._keep(optimiser=self.optimiser)
+        self.settings = replace(settings, env=replace(settings.env, seed=self._seed))
 
     def _collector(self) -> Any:
         s = self.settings
@@ -105,7 +85,7 @@ class PpoTrainer:
             return MultiSyncCollector(makers, self.actor, cat_results=0, update_at_each_batch=True, num_threads=1, **common)
         return Collector(makers[0](), self.actor, **common)
 
-    def run(self, frames: int, minutes: float = math.inf, progress: Callable[[curve.Row], object] | None = None) -> list[curve.Row]:
+    def run(self, frames: int, minutes: float = math.inf, progress: Progress | None = None) -> list[curve.Row]:
         """Trains until so many environment steps, or minutes in all, are reached. Interrupted, it keeps what the last batch
         left."""
         collector = self._collector()
@@ -114,12 +94,9 @@ class PpoTrainer:
             for batch in collector:
                 loss = self._learn(batch)
                 self.folder.seconds = time.perf_counter() - started
-                self.folder.rows.append(_row(batch, self.folder.frames, self.folder.seconds, loss))
-                self._save()
+                self._save(_row(batch, self.folder.frames, self.folder.seconds, loss), progress)
                 if self.settings.workers > 1 or self.settings.ray:
                     collector.update_policy_weights_()
-                if progress is not None:
-                    progress(self.folder.rows[-1])
                 if self.folder.frames >= frames or self.folder.seconds >= 60 * minutes:
                     break
         finally:
@@ -149,11 +126,6 @@ class PpoTrainer:
                 self.optimiser.step()
                 last = float(total.detach())
         return last
-
-    def _save(self) -> None:
-        parts = {"actor": self.actor, "critic": self.critic, "optimiser": self.optimiser}
-        states = {name: part.state_dict() for name, part in parts.items()}
-        self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
 
 
 def _row(batch: TensorDictBase, frames: int, seconds: float, loss: float) -> curve.Row:

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import copy
 import math
-import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,36 +21,34 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.learning import curve
-from pbfd_torch.learning.folder import Folder
-from pbfd_torch.learning.networks import SEEN, make_actor, make_critic
-from pbfd_torch.learning.training_env import EnvSettings, check, location_and_scale, plain, seen_more, statistics
+from pbfd_torch.learning.networks import SEEN
+from pbfd_torch.learning.settings import Settings
+from pbfd_torch.learning.trainer import Progress, Trainer
+from pbfd_torch.learning.training_env import location_and_scale, plain, seen_more
 from pbfd_torch.solvers.per_world import chosen, mapped
 
 
-@dataclass(frozen=True)
-class Shac:
+@dataclass(frozen=True, kw_only=True)
+class Shac(Settings):
     """Attributes:
-    env: where.
-    horizon: steps that gradients go through.
-    actor_rate, critic_rate: learning rates, falling to a tenth over `decay` environment steps.
-    epochs: of the critic over each batch. gamma, lmbda, width: the usual ones.
+    horizon: steps that gradients go through. epochs: of the critic.
+    actor_rate, critic_rate: learning rates.
     following: how much of the critic's copy stays in each update. largest: norm that gradients of the actor are cut to.
+
+    See `Settings` for the others.
     """
 
-    env: EnvSettings
     horizon: int = 16
+    epochs: int = 8
+    decay: int = 1_000_000
+    gamma: float = 0.99
     actor_rate: float = 2e-3
     critic_rate: float = 2e-3
-    decay: int = 1_000_000
-    epochs: int = 8
-    gamma: float = 0.99
-    lmbda: float = 0.95
-    width: int = 64
     following: float = 0.4
     largest: float = 1.0
 
     def __post_init__(self) -> None:
-        check(self.gamma, {name: getattr(self, name) for name in ("horizon", "epochs", "width", "decay")})
+        super().__post_init__()
         if self.env.randomization is not None:
             raise InputError("randomization is given: gradients are followed through the scene as it is, so it must be None")
 
@@ -68,34 +64,24 @@ class _Leg:
     ended: Tensor
 
 
-class ShacTrainer:
-    """Trains into a folder, as `PpoTrainer` does."""
+class ShacTrainer(Trainer[Shac]):
+    """See `Trainer`."""
+
+    method = "SHAC"
 
     def __init__(self, settings: Shac, path: Path, resume: bool = False) -> None:
-        torch.manual_seed(settings.env.seed)
-        self.folder, self.settings = Folder(path, "SHAC", settings.env.name, resume), settings
-        self.env: Any = settings.env.make(seed=settings.env.seed + len(self.folder.rows))
+        worlds = settings.env.num_envs
+        super().__init__(settings, path, resume, worlds)
         # a step without a derivative ends those of its world, and no other's
         self.env.simulator.gradients = Gradients(Doubtful.ZERO)
-        width = self.env.observation_spec["observation"].shape[-1]
-        self.actor = make_actor(width, self.env.action_spec, settings.width)
-        self.critic = make_critic(width, settings.width)
         self.target = copy.deepcopy(self.critic)
         self.actor_optimiser = torch.optim.Adam(self.actor.parameters(), settings.actor_rate, betas=(0.7, 0.95))
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), settings.critic_rate, betas=(0.7, 0.95))
-        self._memory = tempfile.TemporaryDirectory(prefix="pbfd-statistics-")
-        self.shared = statistics(settings.env, Path(self._memory.name))
-        self._parts = {"actor": self.actor, "critic": self.critic, "target": self.target}
-        self._parts |= {"actor_optimiser": self.actor_optimiser, "critic_optimiser": self.critic_optimiser}
-        if self.folder.saved is not None:
-            for name, part in self._parts.items():
-                part.load_state_dict(self.folder.saved[name])
-            self.shared.update_(self.folder.saved["statistics"])
-        worlds = settings.env.num_envs
+        self._keep(target=self.target, actor_optimiser=self.actor_optimiser, critic_optimiser=self.critic_optimiser)
         self._state, self._observation = self.env.starts(worlds)
         self._steps, self._return = torch.zeros(worlds, dtype=torch.int64), torch.zeros(worlds)
 
-    def run(self, frames: int, minutes: float = math.inf, progress: Callable[[curve.Row], object] | None = None) -> list[curve.Row]:
+    def run(self, frames: int, minutes: float = math.inf, progress: Progress | None = None) -> list[curve.Row]:
         """See `PpoTrainer.run`."""
         started = time.perf_counter() - self.folder.seconds
         try:
@@ -109,11 +95,7 @@ class ShacTrainer:
                 leg, row = self._act()
                 loss = self._judge(leg)
                 self.folder.seconds = time.perf_counter() - started
-                self.folder.rows.append(curve.Row(seconds=self.folder.seconds, loss=loss, **row))
-                states = {name: part.state_dict() for name, part in self._parts.items()}
-                self.folder.write(asdict(self.settings), states | {"statistics": plain(self.shared)})
-                if progress is not None:
-                    progress(self.folder.rows[-1])
+                self._save(curve.Row(seconds=self.folder.seconds, loss=loss, **row), progress)
         finally:
             self.folder.draw()
         return self.folder.rows

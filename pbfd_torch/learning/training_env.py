@@ -14,7 +14,6 @@ from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import VecNormV2
 
 from pbfd_torch.envs import Randomization, make_env
-from pbfd_torch.errors import InputError
 from pbfd_torch.learning.networks import SEEN
 
 _DECAY = 0.99995  # of the running mean and variance, per step of all worlds
@@ -44,15 +43,6 @@ class EnvSettings:
         """The environment itself."""
         given = {x.name: getattr(self, x.name) for x in fields(self) if x.name not in ("name", "dtype")}
         return make_env(self.name, dtype=getattr(torch, self.dtype), **(given | changes))
-
-
-def check(gamma: float, counts: Mapping[str, int]) -> None:
-    """Of both methods' settings; raises `InputError` for a discount outside [0, 1) and for counts below 1."""
-    for name, count in counts.items():
-        if count < 1:
-            raise InputError(f"{name} is {count}: must be ≥ 1")
-    if not 0 <= gamma < 1:
-        raise InputError(f"gamma is {gamma}: must be from 0 to below 1")
 
 
 def normaliser(shared: TensorDictBase | None = None) -> VecNormV2:

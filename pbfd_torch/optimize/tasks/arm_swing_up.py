@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.errors import InputError
-from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.optimize.costs import Cost, Weights, quadratic
 from pbfd_torch.optimize.decision import Plan
 from pbfd_torch.optimize.ilqr import Improved, Search, ilqr
 from pbfd_torch.optimize.limits import Limits
 from pbfd_torch.optimize.shooting import Progress
-from pbfd_torch.optimize.tasks.task import Outcome
+from pbfd_torch.optimize.tasks.task import Outcome, Task
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuator, Actuators
@@ -57,17 +56,10 @@ def _scene(dtype: torch.dtype, device: torch.device | str) -> Scene:
 
 
 @dataclass(frozen=True)
-class ArmSwingUp:
-    """iLQR from random controls, about a tenth of the limits, and from nearly hanging. `worlds` ≥ 1; `seed` of the starts."""
+class ArmSwingUp(Task):
+    """iLQR from random controls, about a tenth of the limits, and from nearly hanging."""
 
-    worlds: int = 20
-    seed: int = 0
-    dtype: torch.dtype = torch.float64
-    device: torch.device | str = "cpu"
-
-    def __post_init__(self) -> None:
-        if self.worlds < 1:
-            raise InputError(f"worlds is {self.worlds}: must be ≥ 1")
+    iterations: ClassVar[int] = 30
 
     @property
     def criterion(self) -> str:
@@ -75,23 +67,18 @@ class ArmSwingUp:
         return f"both joints within {NEAR:g} rad of upright after {STEPS * DT:g} s, slower than {SLOW:g} rad/s"
 
     @property
-    def iterations(self) -> int:
-        """See `Task`."""
-        return 30
-
-    @property
     def simulator(self) -> Simulator[Velocities]:
         """Of 2.8 s at steps of 70 ms."""
-        return Simulator(_scene(self.dtype, self.device), DT, gradients=Gradients(doubtful=Doubtful.ZERO))
+        return self.simulated(_scene(self.dtype, self.device), DT)
 
     @property
     def limits(self) -> Limits:
         """Of the motors."""
-        return Limits.within(torch.tensor(EFFORT, dtype=self.dtype, device=self.device))
+        return Limits.within(self.tensor(EFFORT))
 
     def plan(self, simulator: Simulator[Velocities]) -> Plan[Velocities]:
         """The random starts."""
-        generator = torch.Generator().manual_seed(self.seed)
+        generator = self.generator()
         q = 0.05 * torch.randn(self.worlds, 2, dtype=torch.float64, generator=generator)
         controls = 0.1 * torch.randn(-(-STEPS // HELD), self.worlds, 2, dtype=torch.float64, generator=generator)
         rows = self.limits.upper * controls.to(self.device, self.dtype).repeat_interleave(HELD, 0)[:STEPS]
@@ -99,8 +86,7 @@ class ArmSwingUp:
 
     def cost(self, simulator: Simulator[Velocities]) -> Cost[Velocities]:
         """Little for torque, much for not standing upright at the end."""
-        upright = torch.tensor(UPRIGHT, dtype=self.dtype, device=self.device)
-        return quadratic(simulator, upright, Weights(control=3e-3), Weights(q=50.0, v=5.0))
+        return quadratic(simulator, self.tensor(UPRIGHT), Weights(control=3e-3), Weights(q=50.0, v=5.0))
 
     def reached(self, simulator: Simulator[Velocities], improved: Improved[Velocities]) -> Tensor:
         """`[worlds]` bool."""

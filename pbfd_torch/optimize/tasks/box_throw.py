@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Sphere
-from pbfd_torch.errors import InputError
-from pbfd_torch.gradients.implicit import Doubtful, Gradients
 from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.identify.levenberg_marquardt import Bounds, Stopping
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.optimize.decision import StartVelocity
-from pbfd_torch.optimize.shooting import Progress, Shooting
-from pbfd_torch.optimize.tasks.task import Outcome
+from pbfd_torch.optimize.shooting import Progress, Shooting, Shot
+from pbfd_torch.optimize.tasks.shooting_task import ShootingTask
 from pbfd_torch.scene import Scene
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
@@ -52,18 +50,11 @@ def _scene(dtype: torch.dtype, device: torch.device | str) -> Scene:
 
 
 @dataclass(frozen=True)
-class BoxThrow:
+class BoxThrow(ShootingTask):
     """Gauss–Newton from random throws, whose upward velocity and spin stay as they are: where the box comes to rest jumps a little
-    where the step in which it lands becomes another one, and a descent would stop there. `worlds` ≥ 1; `seed` of the starts."""
+    where the step in which it lands becomes another one, and a descent would stop there."""
 
-    worlds: int = 20
-    seed: int = 0
-    dtype: torch.dtype = torch.float64
-    device: torch.device | str = "cpu"
-
-    def __post_init__(self) -> None:
-        if self.worlds < 1:
-            raise InputError(f"worlds is {self.worlds}: must be ≥ 1")
+    iterations: ClassVar[int] = 30
 
     @property
     def criterion(self) -> str:
@@ -71,16 +62,9 @@ class BoxThrow:
         return f"the box within {100 * NEAR:g} cm of the target, at rest ({SLOW:g} m/s, {SLOW:g} rad/s)"
 
     @property
-    def iterations(self) -> int:
-        """See `Task`."""
-        return 30
-
-    @property
     def shooting(self) -> Shooting[Velocities]:
         """What moves: 1.2 s at steps of 40 ms."""
-        simulator: Simulator[Velocities] = Simulator(
-            _scene(self.dtype, self.device), DT, gradients=Gradients(doubtful=Doubtful.ZERO)
-        )
+        simulator = self.simulated(_scene(self.dtype, self.device), DT)
         q = simulator.articulation.rest.clone()
         q[2] = HEIGHT
         v = q.new_zeros(self.worlds, 6)
@@ -90,9 +74,8 @@ class BoxThrow:
 
     @property
     def _random(self) -> Tensor:
-        """Uniform in 0 … 1, `[worlds, 4]`, the same for every call."""
-        generator = torch.Generator().manual_seed(self.seed)
-        return torch.rand(self.worlds, 4, dtype=torch.float64, generator=generator).to(self.device, self.dtype)
+        """Of velocity and spin, `[worlds, 4]` in 0 … 1."""
+        return self.uniform(self.worlds, 4)
 
     @property
     def starts(self) -> Tensor:
@@ -102,7 +85,7 @@ class BoxThrow:
     @property
     def _throws(self) -> Tensor:
         """Velocities `[worlds, 3]`."""
-        least, most = (torch.tensor(x, dtype=self.dtype, device=self.device) for x in (LEAST, MOST))
+        least, most = self.tensor(LEAST), self.tensor(MOST)
         return least + (most - least) * self._random[:, :3]
 
     def residual(self, motion: Trajectory[Velocities], controls: Tensor | None) -> Tensor:
@@ -116,9 +99,6 @@ class BoxThrow:
         still = (motion.v[-1].abs() < SLOW).all(-1)
         return (torch.linalg.vector_norm(gap, dim=-1) < NEAR) & still & motion.solved.all(0)
 
-    def solve(self, iterations: int, progress: Progress | None = None) -> Outcome[Velocities]:
-        """See `Task`."""
-        shooting, x = self.shooting, self.starts
-        shot = shooting.gauss_newton(self.residual, x, Stopping(iterations, step=1e-3), progress)
-        before, reached = shooting.decision.plan(x), self.reached(shot.trajectory)
-        return Outcome(shooting.simulator, before, shot.plan, shot.history, reached, shot.unsolved, shot.doubtful)
+    def shot(self, shooting: Shooting[Velocities], x: Tensor, iterations: int, progress: Progress | None) -> Shot[Velocities]:
+        """See `ShootingTask`."""
+        return shooting.gauss_newton(self.residual, x, Stopping(iterations, step=1e-3), progress)
