@@ -14,47 +14,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pbfd_torch.solvers.directions import Direction, Model, Newton
+from pbfd_torch.solvers.directions import Direction, Newton
 from pbfd_torch.solvers.lock_step import lock_step
-from pbfd_torch.solvers.objective import Evaluation, Objective, Solution, Status
+from pbfd_torch.solvers.objective import Objective, Solution, Status
 from pbfd_torch.solvers.per_world import chosen
+from pbfd_torch.solvers.progress import AT_GUESS, AT_RETREAT, SEARCHING, Progress, Sighting
 from pbfd_torch.solvers.searches import Memory, Search, Trial, WorkSearch
-
-_AT_GUESS, _AT_RETREAT, _SEARCHING = 0, 1, 2
-
-
-@dataclass(frozen=True, eq=False)
-class Progress:
-    """Where every world stands, all `[*batch, …]`: at q, about to evaluate `trial`, which lies at a·direction from it.
-
-    error: ‖r/…‖ at q; status: `Status`, of worlds that do not run any more."""
-
-    q: Tensor
-    trial: Tensor
-    retreat: Tensor
-    stage: Tensor
-    direction: Tensor
-    model: Model | None
-    memory: Memory
-    error: Tensor
-    status: Tensor
-    running: Tensor
-    iterations: Tensor
-    evaluations: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """What the worlds have found at their trials, before they decide how to go on.
-
-    progress: with those ended that have arrived or are lost. error: ‖r/…‖ at the trials. retreating: who leaves its guess for the
-    retreat; usable: whose trial may be gone on from."""
-
-    progress: Progress
-    evaluation: Evaluation
-    error: Tensor
-    retreating: Tensor
-    usable: Tensor
 
 
 @dataclass(frozen=True)
@@ -94,7 +59,7 @@ class Descent:
             q=guess,
             trial=guess,
             retreat=guess if retreat is None else retreat.expand_as(guess),
-            stage=count + (_AT_RETREAT if retreat is None else _AT_GUESS),
+            stage=count + (AT_RETREAT if retreat is None else AT_GUESS),
             direction=(objective.scale * zero[..., None]).to(guess.dtype),
             model=None,
             memory=self.search.begin(like),
@@ -115,9 +80,9 @@ class Descent:
         evaluation = objective.evaluate(p.trial)
         error = objective.error(evaluation, self.tolerance_for(p.q.dtype))
         finite = torch.isfinite(error) & torch.isfinite(p.trial).all(-1)
-        searching = p.stage == _SEARCHING
-        retreating = p.running & (p.stage == _AT_GUESS) & ~(finite & (error <= self.retreat_above))
-        lost = p.running & (p.stage == _AT_RETREAT) & ~finite
+        searching = p.stage == SEARCHING
+        retreating = p.running & (p.stage == AT_GUESS) & ~(finite & (error <= self.retreat_above))
+        lost = p.running & (p.stage == AT_RETREAT) & ~finite
         usable = p.running & finite & ~retreating
         arrived = usable & (error <= self.tolerance_for(p.q.dtype))
         status = torch.where(arrived, int(Status.SOLVED), p.status)
@@ -135,7 +100,7 @@ class Descent:
     def proceed(self, objective: Objective, sighting: Sighting) -> Progress:
         """The second half: every world that runs sets out in a new direction, or changes the length or the damping of its step."""
         p, evaluation = sighting.progress, sighting.evaluation
-        searching = p.stage == _SEARCHING
+        searching = p.stage == SEARCHING
         old = p.model if p.model is not None else self.direction.model(objective, evaluation, None, p.direction, ~searching)
         verdict, memory = self.search.judge(p.memory, Trial(objective, self.direction, evaluation, old, p.direction))
         accept = sighting.usable & (~searching | verdict.good)
@@ -151,7 +116,7 @@ class Descent:
 
         q = chosen(accept, p.trial, p.q)
         trial = objective.retract(q, memory.length[..., None] * direction)
-        stage = torch.where(accept, _SEARCHING, torch.where(sighting.retreating, _AT_RETREAT, p.stage))
+        stage = torch.where(accept, SEARCHING, torch.where(sighting.retreating, AT_RETREAT, p.stage))
         return Progress(
             q=q,
             trial=chosen(sighting.retreating, p.retreat, trial),
@@ -176,7 +141,7 @@ def renewed(progress: Progress, where: Tensor, guess: Tensor, retreat: Tensor, m
         q=chosen(where, guess, progress.q),
         trial=chosen(where, guess, progress.trial),
         retreat=chosen(where, retreat, progress.retreat),
-        stage=torch.where(where, _AT_GUESS, progress.stage),
+        stage=torch.where(where, AT_GUESS, progress.stage),
         memory=chosen(where, memory, progress.memory),
         status=torch.where(where, int(Status.ITERATION_LIMIT), progress.status),
         running=where | progress.running,

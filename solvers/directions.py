@@ -12,6 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from pbfd_torch.solvers.linear import least_squares, solved, solved_with_sign
 from pbfd_torch.solvers.objective import Evaluation, Objective, Valued
 
 Model = tuple[Tensor, ...]  # every entry [*batch, ...]; the residual first
@@ -95,20 +96,22 @@ class Newton(_Root):
     def step(self, model: Model, damping: Tensor) -> Tensor:
         """See `Direction`."""
         r, jacobian, stiffness, _ = model
-        factor, pivots, _ = torch.linalg.lu_factor_ex(torch.stack((jacobian, stiffness)))
-        newton, convex = torch.linalg.lu_solve(factor, pivots, torch.stack((-r, -r))[..., None]).squeeze(-1).unbind(0)
-        first = torch.where((_determinant_sign(factor[0], pivots[0]) > 0)[..., None], newton, convex)
+        steps, signs = solved_with_sign(torch.stack((jacobian, stiffness)), torch.stack((-r, -r))[..., None])
+        newton, convex = steps.squeeze(-1).unbind(0)
+        first = torch.where((signs[0] > 0)[..., None], newton, convex)
         return _first_descending(r, first, convex, newton, _scaled(r, stiffness))
 
 
 @dataclass(frozen=True)
 class ProjectedNewton(_Root):
-    """Newton's step where it descends, else that of J with the negative eigenvalues of its symmetric part turned positive."""
+    """Newton's step where it descends, else that of J with the negative eigenvalues of its symmetric part turned positive: to
+    compare `Newton` with. The only direction that makes the host wait for a device: PyTorch checks there whether the eigenvalues
+    were found."""
 
     def step(self, model: Model, damping: Tensor) -> Tensor:
         r, jacobian, stiffness, _ = model
-        newton, _ = torch.linalg.solve_ex(jacobian, -r)
-        positive, _ = torch.linalg.solve_ex(projected(jacobian), -r)
+        steps = solved(torch.stack((jacobian, projected(jacobian))), torch.stack((-r, -r))[..., None])
+        newton, positive = steps.squeeze(-1).unbind(0)
         return _first_descending(r, newton, positive, _scaled(r, stiffness))
 
 
@@ -124,9 +127,8 @@ class JtjLm(_Root):
         columns = torch.linalg.vector_norm(scaled, dim=-2)
         columns = torch.where(columns > 0, columns, torch.ones_like(columns))
         stacked = torch.cat((scaled, torch.diag_embed(torch.sqrt(damping)[..., None] * columns)), -2)
-        q, upper = torch.linalg.qr(stacked.nan_to_num())
-        right = -(q.mT[..., : r.shape[-1]] @ (r / scale)[..., None])
-        return torch.linalg.solve_triangular(upper, right, upper=True).squeeze(-1)
+        right = torch.nn.functional.pad(-r / scale, (0, r.shape[-1]))
+        return least_squares(stacked.nan_to_num(), right[..., None]).squeeze(-1)
 
 
 @dataclass(frozen=True)
@@ -140,8 +142,8 @@ class Lm(Minimising):
     def step(self, model: Model, damping: Tensor) -> Tensor:
         r, hessian, stiffness = model
         added = torch.diag_embed(damping[..., None] * _positive_diagonal(stiffness))
-        steps, _ = torch.linalg.solve_ex(torch.stack((hessian + added, stiffness + added)), torch.stack((-r, -r)))
-        exact, convex = steps.unbind(0)
+        steps = solved(torch.stack((hessian + added, stiffness + added)), torch.stack((-r, -r))[..., None])
+        exact, convex = steps.squeeze(-1).unbind(0)
         return _first_descending(r, exact, convex, _scaled(r, stiffness + added))
 
 
@@ -156,7 +158,7 @@ class GaussNewtonLm(Minimising):
     def step(self, model: Model, damping: Tensor) -> Tensor:
         r, stiffness = model
         damped = stiffness + torch.diag_embed(damping[..., None] * _positive_diagonal(stiffness))
-        step, _ = torch.linalg.solve_ex(damped, -r)
+        step = solved(damped, -r[..., None]).squeeze(-1)
         return _first_descending(r, step, _scaled(r, damped))
 
 
@@ -172,12 +174,6 @@ def projected(jacobian: Tensor) -> Tensor:
     floor = torch.finfo(values.dtype).eps ** 0.5 * values.abs().amax(-1, keepdim=True)
     lifted = torch.maximum(values.abs(), floor)
     return jacobian + (vectors * (lifted - values)[..., None, :]) @ vectors.mT
-
-
-def _determinant_sign(factor: Tensor, pivots: Tensor) -> Tensor:
-    """1, 0 or −1 (NaN stays NaN) `[*batch]`, of an LU factorisation with its row exchanges."""
-    swapped = pivots != torch.arange(1, pivots.shape[-1] + 1, dtype=pivots.dtype, device=pivots.device)
-    return factor.diagonal(dim1=-2, dim2=-1).sign().prod(-1) * (1 - 2 * (swapped.sum(-1) % 2))
 
 
 def _positive_diagonal(matrix: Tensor) -> Tensor:

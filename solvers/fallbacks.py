@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.objective import Objective, Relaxable, Solution, Status, unsolved_worlds
+from pbfd_torch.solvers.objective import Objective, Relaxable, Solution, Status
 
 
 class Detour(Protocol):
@@ -116,14 +116,14 @@ class Fallbacks:
         """The solution of the direct way with its unsolved worlds led along the detours, from `start`; what these leave tries the
         direct way from `guess` after all, as the retreat from it may have been the mistake. Both starts are `[*batch, nq]`."""
         for detour in self.detours:
-            index = unsolved_worlds(solution)
+            index = solution.unsolved
             if len(index) == 0:
                 return solution
             part = objective.take(index)
             climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
             climbs.append(self.last.solve(part, climbs[-1].q))
             solution = merged(solution, index, climbs, detour.kind, detour.status)
-        index = unsolved_worlds(solution)
+        index = solution.unsolved
         if len(index) == 0 or guess is start:
             return solution
         again = self.last.solve(objective.take(index), guess.reshape(-1, guess.shape[-1])[index])

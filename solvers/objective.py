@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, Self, runtime_checkable
 
 import torch
@@ -148,7 +149,13 @@ class Solution:
         """`[*batch]` bool."""
         return is_solved(self.status)
 
+    @cached_property
+    def unsolved(self) -> Tensor:
+        """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start. Whoever
+        asks first makes the host wait for a device; it is known after that."""
+        return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+
 
 def unsolved_worlds(solution: Solution) -> Tensor:
-    """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start."""
-    return (~solution.solved & (solution.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+    """`solution.unsolved`."""
+    return solution.unsolved

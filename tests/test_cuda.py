@@ -11,9 +11,10 @@ from torch import Tensor
 from pbfd_torch import Rollout, Simulator
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.models import SCENES
-from pbfd_torch.solvers.descent import Descent, Progress
+from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.named import jtj_lm, lbfgs
 from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.solvers.progress import Progress
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")]
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.primitives import BoxSurface
 from pbfd_torch.contact.surface import Placed, Tangent
+from pbfd_torch.tensors.vectors import applied, in_frames
 from pbfd_torch.tensors.worlds import replaced
 
 
@@ -38,8 +39,8 @@ class BallBoxPairs(Finder):
     def find(self, bodies: Tensor, reach: Tensor) -> Slots:
         """See `Finder`."""
         first, second = bodies[..., self.first, :3, :], bodies[..., self.second, :3, :]
-        centers = (first[..., :3] @ self.position[..., None]).squeeze(-1) + first[..., 3]
-        seen = (second[..., :3].mT @ (centers - second[..., 3])[..., None]).squeeze(-1)
+        centers = applied(first[..., :3], self.position) + first[..., 3]
+        seen = in_frames(second, centers)
         gap = self._box(torch.arange(len(self.pair), device=self.pair.device)).field(seen).distance - self.radius
         moves = reach[..., self.first] + reach[..., self.second]
         which, filled, dropped = nearest(gap, gap < moves, self.slots)

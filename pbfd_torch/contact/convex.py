@@ -14,12 +14,13 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from pbfd_torch.contact.primitives import around_segment, dot, from_segment, require_tensors, unit
+from pbfd_torch.contact.primitives import require_tensors
+from pbfd_torch.contact.segments import around_segment, from_segment
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import dot_of_rows, unit
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -56,6 +57,8 @@ class ConvexSurface:
     @staticmethod
     def from_vertices(vertices: NDArray[np.float64], dtype: torch.dtype, device: torch.device) -> ConvexSurface:
         """The convex hull of points `[n ≥ 4, 3]` [m], which must not lie in one plane. Raises InputError."""
+        from scipy.spatial import ConvexHull, QhullError  # takes .3 s, and few scenes need it
+
         if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < 4:
             raise InputError(f"hull vertices have shape {vertices.shape}: must be [n ≥ 4, 3]")
         if not np.isfinite(vertices).all():
@@ -80,25 +83,25 @@ class ConvexSurface:
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         place = points.detach()[..., None, :]
-        heights = dot(place, self.normals) - self.offsets
+        heights = dot_of_rows(place, self.normals) - self.offsets
         highest = heights.argmax(-1)
         face = self.normals[highest]
-        height = dot(points, face) - self.offsets[highest]
+        height = dot_of_rows(points, face) - self.offsets[highest]
         foot = (points - height[..., None] * face).detach()[..., None, :]
-        overhang = (dot(foot, self.normals) - self.offsets).amax(-1)
+        overhang = (dot_of_rows(foot, self.normals) - self.offsets).amax(-1)
         rounding = 8 * torch.finfo(points.dtype).eps * (self._size + height.detach().abs())
 
         offsets, _, _ = from_segment(place, self.starts, self.ends)
-        nearest = dot(offsets, offsets).argmin(-1)
-        offset, axis, beside = from_segment(points, self.starts[nearest], self.ends[nearest])
-        direction, inverse = unit(offset, face)
+        nearest = dot_of_rows(offsets, offsets).argmin(-1)
+        offset, direction, beside = from_segment(points, self.starts[nearest], self.ends[nearest])
+        outward, inverse = unit(offset, face)
 
         on_face = overhang <= rounding
-        distance = torch.where(on_face, height, dot(offset, direction))
-        normal = torch.where(on_face[..., None], face, direction)
+        distance = torch.where(on_face, height, dot_of_rows(offset, outward))
+        normal = torch.where(on_face[..., None], face, outward)
 
         def curvature() -> Tensor:
-            return around_segment(direction, axis, beside, torch.where(on_face, 0.0, inverse))
+            return around_segment(outward, direction, beside, torch.where(on_face, 0.0, inverse))
 
         return Field(distance, normal, curvature)
 

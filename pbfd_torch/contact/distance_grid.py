@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -15,6 +14,9 @@ from torch import Tensor
 from pbfd_torch.contact.splines import coefficients_through, evaluate
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.constants import filled
+from pbfd_torch.tensors.facts import fact
+from pbfd_torch.tensors.vectors import dot, outer
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -31,6 +33,9 @@ class DistanceGrid:
     origin: Tensor
     spacing: Tensor
     coefficients: Tensor
+
+    def __post_init__(self) -> None:
+        _ = self.last
 
     @classmethod
     def through(
@@ -53,21 +58,20 @@ class DistanceGrid:
             torch.tensor(origin, dtype=dtype, device=device), torch.tensor(spacing, dtype=dtype, device=device), coefficients
         )
 
-    @cached_property
+    @fact("origin", "spacing", "coefficients")
     def last(self) -> Tensor:
         """The last node `[3]` [m]."""
-        cells = [size - 3 for size in self.coefficients.shape]
-        return self.origin + self.spacing * torch.tensor(cells, dtype=self.origin.dtype, device=self.origin.device)
+        return self.origin + self.spacing * filled([size - 3 for size in self.coefficients.shape], self.origin)
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         beyond = points - points.clamp(self.origin, self.last)
-        rounded = ((beyond * beyond).sum(-1) + self.spacing * self.spacing).sqrt()
+        rounded = (dot(beyond, beyond) + self.spacing * self.spacing).sqrt()
         distance, normal = evaluate(self.coefficients, self.origin, self.spacing, points, 1)
 
         def curvature() -> Tensor:
             turn = beyond / rounded.unsqueeze(-1)
-            bend = torch.diag_embed((beyond != 0).to(points.dtype)) - turn.unsqueeze(-1) * turn.unsqueeze(-2)
+            bend = torch.diag_embed((beyond != 0).to(points.dtype)) - outer(turn, turn)
             hessian = evaluate(self.coefficients, self.origin, self.spacing, points, 2)[2]
             return hessian + bend / rounded[..., None, None]
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from pbfd_torch.contact.splines import coefficients_through, evaluate
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import dot, outer, rotated
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -79,9 +80,9 @@ class HeightSurface:
         """See `Surface`."""
         height, slope, bend = evaluate(self.coefficients, self.origin, self.spacing, points[..., :2], 2)
         above = points[..., 2] - height
-        steepness = (1 + (slope * slope).sum(-1)).rsqrt()  # s = 1/√(1 + |∇h|²)
+        steepness = (1 + dot(slope, slope)).rsqrt()  # s = 1/√(1 + |∇h|²)
         upward = torch.cat((-slope, torch.ones_like(slope[..., :1])), -1)  # ∇(z − h)
-        along = (bend * slope.unsqueeze(-2)).sum(-1)  # ½ ∇|∇h|²
+        along = rotated(bend, slope)  # ½ ∇|∇h|²
         easing = _level(-(steepness**3).unsqueeze(-1) * along)  # ∇s
         normal = steepness.unsqueeze(-1) * upward + above.unsqueeze(-1) * easing
 
@@ -90,7 +91,7 @@ class HeightSurface:
             s = steepness[..., None, None]
             change = (twist * slope[..., None, None, :]).sum(-1) + (bend.unsqueeze(-2) * bend.unsqueeze(-3)).sum(-1)
             easing2 = 3 * s**5 * along.unsqueeze(-1) * along.unsqueeze(-2) - s**3 * change  # ∇∇s
-            mixed = upward.unsqueeze(-1) * easing.unsqueeze(-2)
+            mixed = outer(upward, easing)
             level = above[..., None, None] * easing2 - s * bend
             return mixed + mixed.mT + _level(_level(level).mT).mT
 

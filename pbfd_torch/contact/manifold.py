@@ -23,8 +23,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.polytope import PolytopeTable
-from pbfd_torch.contact.separation import relative_pose, rotated
+from pbfd_torch.contact.segments import share_of
+from pbfd_torch.contact.separation import relative_pose
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import dot, rotated
 
 _ALIGNED = 1e-5  # 1 − cosine of the largest angle between a face's normal and the separation's direction in face contact
 _EDGEWISE = 1e-3  # |cosine| between incident and reference normals under which nothing is projected on the incident polygon
@@ -77,7 +79,7 @@ def manifold(
     rotation, translation = relative_pose(base, other)
     vertices = rotated(rotation[:, None], table.vertices[incident]) + translation[:, None]
     toward = rotated(base[:, :3, :3].mT, torch.where(swapped[:, None], -normal, normal))
-    support = _dot(table.vertices[reference], toward[:, None]).amax(-1)
+    support = dot(table.vertices[reference], toward[:, None]).amax(-1)
     n = torch.where(by_face[:, None], table.normals[reference, face], toward)
     offset = torch.where(by_face, table.offsets[reference, face], support)
 
@@ -94,7 +96,7 @@ def manifold(
     points = torch.cat((on_face, on_edge, vertices), 1)
     all_corners = whole[:, None].expand(vertices.shape[:2])
     valid = torch.cat((inside & by_face[:, None], met & ~by_face[:, None], all_corners), 1)
-    points, mask = _spread(points, valid, _dot(points, n[:, None]), most, merged)
+    points, mask = _spread(points, valid, dot(points, n[:, None]), most, merged)
     turn = rotation.mT[:, None]
     return Manifold(
         point=rotated(turn, points - translation[:, None]),
@@ -110,7 +112,7 @@ def _aligned(table: PolytopeTable, shape: Tensor, pose: Tensor, outward: Tensor)
     """Largest cosine `[K]` between a face's normal and a direction in the world `[K, 3]`, and which face; −1 where there are
     none."""
     local = rotated(pose[:, :3, :3].mT, outward)
-    cosine = torch.where(table.is_face[shape], _dot(table.normals[shape], local[:, None]), -1.0)
+    cosine = torch.where(table.is_face[shape], dot(table.normals[shape], local[:, None]), -1.0)
     return cosine.max(-1)
 
 
@@ -119,10 +121,10 @@ def _incident_polygon(
 ) -> tuple[Tensor, Tensor]:
     """Corners `[K, M, 3]` and normal `[K, 3]` of the polygon that meets a plane with normal n: of the faces at the lowest vertex,
     the most anti-parallel one. The normal is zero for a segment and a point."""
-    heights = _dot(vertices, n[:, None])
+    heights = dot(vertices, n[:, None])
     polygons = table.polygons[shape]
     lowest = heights.gather(1, polygons.flatten(1)).unflatten(1, polygons.shape[1:]).amin(-1)
-    facing = _dot(rotated(rotation[:, None], table.normals[shape]), n[:, None])
+    facing = dot(rotated(rotation[:, None], table.normals[shape]), n[:, None])
     at_lowest = table.is_face[shape] & (lowest <= (heights.amin(-1) + room)[:, None])
     face = torch.where(at_lowest, facing, torch.inf).argmin(-1)
     row = torch.arange(len(face), device=face.device)
@@ -142,9 +144,9 @@ class _Footprint:
         """Distances from each side plane, > 0 outside, `[K, P, 3] → [K, P, M]`; −room for sides of length zero."""
         along = self.corners.roll(-1, 1) - self.corners
         side = torch.linalg.cross(along, self.n[:, None].expand_as(along))
-        square = (side * side).sum(-1, keepdim=True)
+        square = dot(side, side)[..., None]
         side = torch.where(square > 0, side / torch.where(square > 0, square, 1.0).sqrt(), 0.0)
-        return _dot(points[:, :, None] - self.corners[:, None], side[:, None]) - self.room[:, None, None]
+        return dot(points[:, :, None] - self.corners[:, None], side[:, None]) - self.room[:, None, None]
 
     def cut(self, polygon: Tensor, normal: Tensor, coarse: Tensor) -> tuple[Tensor, Tensor]:
         """Where an incident polygon `[K, M, 3]` with its normal `[K, 3]` lies over the footprint: points `[K, 3 M + 1, 3]`, and
@@ -160,24 +162,24 @@ class _Footprint:
         over = (enter <= leave) & ~((beyond > 0) & (far > 0)).any(-1)
         ends = torch.cat([polygon + t[..., None] * (end - polygon) for t in (enter, leave)], 1)
 
-        facing = -_dot(normal, self.n)
+        facing = -dot(normal, self.n)
         flat = facing > _EDGEWISE
-        height = _dot(polygon[:, :1] - self.corners, normal[:, None]) / torch.where(flat, -facing, 1.0)[:, None]
+        height = dot(polygon[:, :1] - self.corners, normal[:, None]) / torch.where(flat, -facing, 1.0)[:, None]
         projected = self.corners + height[..., None] * self.n[:, None]
         incident = _Footprint(polygon, -self.n, self.room)
         within = flat[:, None] & (incident.outside(projected) <= 0).all(-1)
 
         points, found = torch.cat((ends, projected), 1), torch.cat((over, over, within), 1)
-        corner_height = _dot(polygon, self.n[:, None])
+        corner_height = dot(polygon, self.n[:, None])
         nearest = (corner_height + beyond.amax(-1).clamp_min(0)).argmin(-1, keepdim=True)
-        deepest = torch.where(found, _dot(points, self.n[:, None]), torch.inf).amin(-1, keepdim=True)
+        deepest = torch.where(found, dot(points, self.n[:, None]), torch.inf).amin(-1, keepdim=True)
         missed = deepest > corner_height.gather(1, nearest) + coarse[:, None]
         return torch.cat((points, _take(polygon, nearest)), 1), torch.cat((found, missed), 1)
 
 
 def _support_edge(vertices: Tensor, edges: Tensor, n: Tensor) -> Tensor:
     """Ends `[K, 2, 3]` of the flattest edge at the lowest vertex along n."""
-    heights = _dot(vertices, n[:, None])
+    heights = dot(vertices, n[:, None])
     ends = heights.gather(1, edges.flatten(1)).unflatten(1, edges.shape[1:])
     span = heights.amax(-1) - heights.amin(-1)
     lowest = heights.amin(-1) + torch.finfo(heights.dtype).eps ** 0.5 * span
@@ -192,25 +194,19 @@ def _edge_points(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     p, q = first[:, 0], second[:, 0]
     d, e = first[:, 1] - p, second[:, 1] - q
     gap = q - p
-    dd, ee, de = _dot(d, d), _dot(e, e), _dot(d, e)
-    gd, ge = _dot(gap, d), _dot(gap, e)
+    dd, ee, de = dot(d, d), dot(e, e), dot(d, e)
+    gd, ge = dot(gap, d), dot(gap, e)
     sine = dd * ee - de * de
     parallel = sine <= _PARALLEL**2 * dd * ee
     # nearest points of the lines, then each pulled into its segment and matched by the other's
     crossing = torch.where(parallel, 0.5, (de * gd - dd * ge) / torch.where(parallel, 1.0, sine))
-    on_first = _share(gd + crossing.clamp(0, 1) * de, dd)
-    on_second = _share(on_first * de - ge, ee)
+    on_first = share_of(gd + crossing.clamp(0, 1) * de, dd)
+    on_second = share_of(on_first * de - ge, ee)
     # the first segment's ends on the second
-    ends = torch.stack((_share(-ge, ee), _share(de - ge, ee)), -1)
+    ends = torch.stack((share_of(-ge, ee), share_of(de - ge, ee)), -1)
     shares = torch.where(parallel[:, None], ends, on_second[:, None])
     two = parallel & (ends[:, 0] != ends[:, 1])
     return q[:, None] + shares[..., None] * e[:, None], torch.stack((torch.ones_like(two), two), -1)
-
-
-def _share(along: Tensor, square: Tensor) -> Tensor:
-    """Parameter in [0, 1] on a segment with that squared length; 0 where it has none."""
-    proper = square > 0
-    return torch.where(proper, along / torch.where(proper, square, 1.0), 0.0).clamp(0, 1)
 
 
 def _spread(points: Tensor, valid: Tensor, heights: Tensor, most: int, merged: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,7 +217,7 @@ def _spread(points: Tensor, valid: Tensor, heights: Tensor, most: int, merged: T
     far = torch.where(valid, torch.inf, -1.0).to(points.dtype)
     for _ in range(most - 1):
         step = points.detach() - taken[-1].detach()
-        far = torch.minimum(far, _dot(step, step))
+        far = torch.minimum(far, dot(step, step))
         reach, index = far.max(-1, keepdim=True)
         distinct = reach > merged[:, None] ** 2
         there.append(distinct)
@@ -229,12 +225,8 @@ def _spread(points: Tensor, valid: Tensor, heights: Tensor, most: int, merged: T
     return torch.cat(taken, 1), torch.cat(there, 1)
 
 
-def _dot(x: Tensor, y: Tensor) -> Tensor:
-    return (x * y).sum(-1)
-
-
 def _length(x: Tensor) -> Tensor:
-    return _dot(x, x).detach().sqrt()
+    return dot(x, x).detach().sqrt()
 
 
 def _take(vertices: Tensor, index: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from tqdm import tqdm
 
 from pbfd_torch.contact.distance_grid import DistanceGrid
@@ -183,6 +182,8 @@ class _Distance:
     """Distance to triangles `[m, 3, 3]`, found through pieces of them of about a cell."""
 
     def __init__(self, corners: Points, cell: float) -> None:
+        from scipy.spatial import cKDTree  # takes .3 s, and few scenes need it
+
         self.cell = cell
         edges = np.roll(corners, -1, 1) - corners
         normal = np.cross(edges[:, 0], edges[:, 1])

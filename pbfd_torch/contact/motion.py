@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.constants import filled
 from pbfd_torch.tree.articulation import homogeneous
 from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix
 
@@ -97,8 +98,7 @@ class Turntable:
     def pose(self, time: Tensor) -> Tensor:
         """See `Motion`."""
         size = math.hypot(*self.axis)
-        axis = torch.tensor([x / size for x in self.axis], dtype=time.dtype, device=time.device)
-        center = torch.tensor(self.center, dtype=time.dtype, device=time.device)
+        axis, center = filled([x / size for x in self.axis], time), filled(self.center, time)
         turn = quaternion_matrix(quaternion_exp(self.rate * time[..., None] * axis))
         return homogeneous(turn, center - (turn @ center[:, None]).squeeze(-1))
 
@@ -122,4 +122,4 @@ class Lift:
 
     def pose(self, time: Tensor) -> Tensor:
         """See `Motion`."""
-        return _shifted(self.path(time)[..., None] * torch.tensor(self.direction, dtype=time.dtype, device=time.device))
+        return _shifted(self.path(time)[..., None] * filled(self.direction, time))

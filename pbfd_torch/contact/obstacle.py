@@ -14,6 +14,8 @@ from pbfd_torch.contact.polytope import thickness_of
 from pbfd_torch.contact.shapes import Nearby, Shape, Solid
 from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.constants import filled
+from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.articulation import homogeneous
 from pbfd_torch.tree.rotations import quaternion_matrix
@@ -65,14 +67,17 @@ class Carrier:
     start: Tensor
     motion: Motion
 
+    def __post_init__(self) -> None:
+        _ = self.belt
+
     def pose(self, time: Tensor) -> Tensor:
         """`[*batch, 4, 4]` at `time` `[*batch]` [s]."""
         return self.motion.pose(time) @ self.start if self.motion.moves else self.start
 
-    @property
+    @fact("start", "motion")
     def belt(self) -> Tensor:
         """Velocity of the running surface in the obstacle's frame `[3]` [m/s]."""
-        return torch.tensor(self.motion.belt, dtype=self.start.dtype, device=self.start.device)
+        return filled(self.motion.belt, self.start)
 
     def take(self, worlds: Worlds) -> Carrier:
         """The same obstacle in some worlds."""

@@ -10,7 +10,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -20,8 +19,11 @@ from pbfd_torch.contact.broad_phase import AllPairs, BroadPhase, FclTree
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.manifold import Manifold, manifold
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
-from pbfd_torch.contact.separation import box_separation, fcl_geometries, fcl_separation, rotated
+from pbfd_torch.contact.separation import box_separation, fcl_geometries, fcl_separation
 from pbfd_torch.contact.surface import Plane
+from pbfd_torch.tensors.constants import indices
+from pbfd_torch.tensors.facts import fact
+from pbfd_torch.tensors.vectors import applied, dot, rotated
 
 POINTS = 8  # of one pair at most
 MANY = 30_000  # pairs from which on FCL's tree is faster than looking at all of them
@@ -60,17 +62,13 @@ class PolytopePairs(Finder):
         """From pairs (number, collider, collider); of each collider its body, its frame in it `[c, 4, 4]`, its shape, and whether
         that is a box."""
         device = frames.device
-
-        def index(values: Sequence[int]) -> Tensor:
-            return torch.tensor(values, dtype=torch.long, device=device)
-
-        first, second = index([a for _, a, _ in pairs]), index([b for _, _, b in pairs])
+        first, second = indices([a for _, a, _ in pairs], device), indices([b for _, _, b in pairs], device)
         boxes = [are_boxes[a] and are_boxes[b] for _, a, b in pairs]
         return PolytopePairs(
-            pair=index([k for k, _, _ in pairs]),
+            pair=indices([k for k, _, _ in pairs], device),
             first=first,
             second=second,
-            body=index(bodies),
+            body=indices(bodies, device),
             frame=frames,
             polytopes=tuple(polytopes),
             table=PolytopeTable.stack(polytopes).to(frames.dtype, device),
@@ -79,7 +77,10 @@ class PolytopePairs(Finder):
             slots=slots,
         )
 
-    @cached_property
+    def __post_init__(self) -> None:
+        _ = self._all_boxes, self._middle  # found here, so that no step has to wait for them
+
+    @fact("polytopes")
     def _geometries(self) -> list[Any]:
         """FCL's shapes, which all worlds share; a copy in another process makes its own."""
         return fcl_geometries(self.polytopes)
@@ -87,7 +88,7 @@ class PolytopePairs(Finder):
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
-    @cached_property
+    @fact("boxes")
     def _all_boxes(self) -> bool:
         return bool(self.boxes.all())
 
@@ -95,8 +96,7 @@ class PolytopePairs(Finder):
         """See `Finder`."""
         batch = bodies.shape[:-3]
         poses = bodies[..., self.body, :, :] @ self.frame
-        vertices = poses[..., None, :3, :3] @ self.table.vertices[..., None]
-        vertices = vertices.squeeze(-1) + poses[..., None, :3, 3]
+        vertices = applied(poses[..., None, :3, :3], self.table.vertices) + poses[..., None, :3, 3]
         room = (self.table.radius + reach[..., self.body])[..., None]
         near = self.broad_phase.near(vertices.amin(-2) - room, vertices.amax(-2) + room)
         world, row = near.reshape(-1, len(self.pair)).nonzero().unbind(-1)
@@ -109,7 +109,7 @@ class PolytopePairs(Finder):
         within = found.mask & (gap < moves[:, None])
         return self._slots(batch, world, row, found, points, plane, gap, within)
 
-    @cached_property
+    @fact("polytopes", "frame", "first", "second")
     def _middle(self) -> Tensor:
         """`[m]` half the thickness of the thinner one of each pair [m]."""
         thickness = self.frame.new_tensor([x.thickness for x in self.polytopes])
@@ -137,7 +137,7 @@ class PolytopePairs(Finder):
         points, plane = torch.where(swapped, pose_b, pose_a), torch.where(swapped, pose_a, pose_b)
         place = rotated(points[:, None, :3, :3], found.point) + points[:, None, :3, 3]
         seen = rotated(plane[:, None, :3, :3].mT, place - plane[:, None, :3, 3])
-        gap = (seen * found.normal[:, None]).sum(-1) - found.offset[:, None] - found.radius[:, None]
+        gap = dot(seen, found.normal[:, None]) - found.offset[:, None] - found.radius[:, None]
         return found, gap
 
     def _by_fcl(self, table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor) -> Any:
@@ -178,7 +178,7 @@ class PolytopePairs(Finder):
         frame_of_points, frame_of_plane = self.frame[points[rows]], self.frame[plane[rows]]
         position = rotated(frame_of_points[..., :3, :3], found.point[rows, spot]) + frame_of_points[..., :3, 3]
         normal = rotated(frame_of_plane[..., :3, :3], found.normal[rows])
-        offset = found.offset[rows] + (normal * frame_of_plane[..., :3, 3]).sum(-1)
+        offset = found.offset[rows] + dot(normal, frame_of_plane[..., :3, 3])
         return Slots(
             filled=shaped(filled),
             pair=shaped(self.pair[row[rows]]),
@@ -196,5 +196,5 @@ class PolytopePairs(Finder):
         number = torch.zeros_like(none, dtype=torch.long)
         up = torch.nn.functional.pad(torch.ones_like(zero)[..., None], (2, 0))
         position = zero[..., None].expand(*zero.shape, 3)
-        first, second = number + self.body[self.first[0]], number + self.body[self.second[0]]
+        first, second = number + self.body[self.first[:1]], number + self.body[self.second[:1]]
         return Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])

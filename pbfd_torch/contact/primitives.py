@@ -14,11 +14,11 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.contact.segments import around_segment, from_segment
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import axis, dot, dot_of_rows, outer, unit
 from pbfd_torch.tensors.worlds import Worlds, replaced
-
-_NEGLIGIBLE = 1e-15  # shorter vectors [m] have no direction; its square and that of its inverse fit into float32
 
 
 def require_tensors(**values: tuple[Tensor, int]) -> None:
@@ -41,35 +41,6 @@ def _require_positive(**values: Tensor) -> None:
             raise InputError(f"{name} is {float(value.min())} m: must be > 0 everywhere")
 
 
-def unit(vector: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:
-    """Direction `[*, k]` of a vector and the inverse `[*]` of its length. A negligible vector takes the direction of the
-    fallback, and zero for the inverse. With this direction (vector · direction) is the length, differentiable at zero too."""
-    negligible = (vector * vector).sum(-1, keepdim=True) <= _NEGLIGIBLE**2
-    safe = torch.where(negligible, fallback, vector)
-    length = torch.linalg.vector_norm(safe, dim=-1, keepdim=True)
-    return safe / length, torch.where(negligible, 0.0, 1 / length).squeeze(-1)
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """a · b, `[*, 3] → [*]`. Term by term: several times faster than the sum of products over so short a dimension."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return ax * bx + ay * by + az * bz
-
-
-def outer(a: Tensor) -> Tensor:
-    """a aᵀ, `[*, k] → [*, k, k]`."""
-    return a[..., :, None] * a[..., None, :]
-
-
-def _identity(like: Tensor) -> Tensor:
-    return torch.eye(3, dtype=like.dtype, device=like.device)
-
-
-def _axis(index: int, like: Tensor) -> Tensor:
-    """A unit vector `[3]`, or `[2]` in a plane."""
-    return (torch.arange(like.shape[-1], device=like.device) == index).to(like.dtype)
-
-
 def _one_hot(index: Tensor, like: Tensor) -> Tensor:
     """Unit vectors `[*, k]` along the axes `[*]`."""
     return (torch.arange(like.shape[-1], device=like.device) == index[..., None]).to(like.dtype)
@@ -80,23 +51,7 @@ def _from_orthant(q: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     `[*, k]` and the scale c `[*]` of its Hessian c (D − g gᵀ). Within the orthant the first of the nearest faces counts."""
     beyond = q.clamp_min(0)
     gradient, inverse = unit(beyond, _one_hot(q.argmax(-1), q))
-    return (q * gradient).sum(-1), gradient, (beyond > 0).to(q.dtype), inverse
-
-
-def from_segment(points: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets `[*, 3]` of points from the nearest point of a segment, the segment's direction `[*, 3]` (z where it has no
-    length), and `[*]` which points lie beside the segment, not beyond its ends."""
-    along = end - start
-    axis, _ = unit(along, _axis(2, along))
-    length = dot(along, axis)
-    ahead = dot(points - start, axis)
-    nearest = start + torch.minimum(ahead.clamp_min(0), length)[..., None] * axis
-    return points - nearest, axis, (ahead > 0) & (ahead < length)
-
-
-def around_segment(normal: Tensor, axis: Tensor, beside: Tensor, inverse: Tensor) -> Tensor:
-    """Hessian `[*, 3, 3]` of the distance from a segment: that of a line for points beside it, that of a point beyond its ends."""
-    return inverse[..., None, None] * (_identity(normal) - outer(normal) - beside[..., None, None] * outer(axis))
+    return dot(q, gradient), gradient, (beyond > 0).to(q.dtype), inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +66,13 @@ class SphereSurface:
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
-        normal, inverse = unit(points, _axis(2, points))
-        distance = dot(points, normal) - self.radius
-        return Field(distance, normal, lambda: inverse[..., None, None] * (_identity(normal) - outer(normal)))
+        normal, inverse = unit(points, axis(2, points))
+
+        def curvature() -> Tensor:
+            eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
+            return inverse[..., None, None] * (eye - outer(normal, normal))
+
+        return Field(dot_of_rows(points, normal) - self.radius, normal, curvature)
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
@@ -135,11 +94,11 @@ class SegmentSurface:
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
-        offset, axis, beside = from_segment(points, self.start, self.end)
-        across = torch.linalg.cross(axis, _one_hot(axis.abs().argmin(-1), axis))
+        offset, direction, beside = from_segment(points, self.start, self.end)
+        across = torch.linalg.cross(direction, _one_hot(direction.abs().argmin(-1), direction))
         normal, inverse = unit(offset, across)
-        distance = dot(offset, normal) - self.radius
-        return Field(distance, normal, lambda: around_segment(normal, axis, beside, inverse))
+        distance = dot_of_rows(offset, normal) - self.radius
+        return Field(distance, normal, lambda: around_segment(normal, direction, beside, inverse))
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
@@ -163,7 +122,7 @@ class BoxSurface:
         side = torch.where(points < 0, -1.0, 1.0).to(points.dtype)
         distance, gradient, across, inverse = _from_orthant(side * points - self.half_extents)
         normal = side * gradient
-        return Field(distance, normal, lambda: inverse[..., None, None] * (across.diag_embed() - outer(normal)))
+        return Field(distance, normal, lambda: inverse[..., None, None] * (across.diag_embed() - outer(normal, normal)))
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
@@ -185,9 +144,9 @@ class CylinderSurface:
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         plane, z = points[..., :2], points[..., 2]
-        radial, turn = unit(plane, _axis(0, plane))
+        radial, turn = unit(plane, axis(0, plane))
         side = torch.where(z < 0, -1.0, 1.0).to(points.dtype)
-        q = torch.stack(((plane * radial).sum(-1) - self.radius, side * z - self.half_length), -1)
+        q = torch.stack((dot(plane, radial) - self.radius, side * z - self.half_length), -1)
         distance, gradient, across, inverse = _from_orthant(q)
         normal = torch.cat((gradient[..., :1] * radial, (side * gradient[..., 1])[..., None]), -1)
 
@@ -195,8 +154,10 @@ class CylinderSurface:
             none = torch.zeros_like(z)
             outward = torch.stack((radial[..., 0], radial[..., 1], none), -1)
             tangent = torch.stack((-radial[..., 1], radial[..., 0], none), -1)
-            kept = across[..., :1, None] * outer(outward) + across[..., 1:, None] * outer(_axis(2, points)) - outer(normal)
-            return inverse[..., None, None] * kept + (turn * gradient[..., 0])[..., None, None] * outer(tangent)
+            upward = axis(2, points)
+            kept = across[..., :1, None] * outer(outward, outward) + across[..., 1:, None] * outer(upward, upward)
+            across_axis = (turn * gradient[..., 0])[..., None, None] * outer(tangent, tangent)
+            return inverse[..., None, None] * (kept - outer(normal, normal)) + across_axis
 
         return Field(distance, normal, curvature)
 

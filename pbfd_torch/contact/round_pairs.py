@@ -14,8 +14,11 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
-from pbfd_torch.contact.primitives import SegmentSurface, dot
+from pbfd_torch.contact.primitives import SegmentSurface
+from pbfd_torch.contact.segments import share_of
 from pbfd_torch.contact.surface import Tangent
+from pbfd_torch.tensors.constants import indices
+from pbfd_torch.tensors.vectors import applied, dot_of_rows, in_frames
 from pbfd_torch.tensors.worlds import replaced
 
 
@@ -51,13 +54,10 @@ class RoundPairs(Finder):
         # spheres give points, capsules are solids
         ordered = [(k, b, a) if a.long and not b.long else (k, a, b) for k, a, b in pairs]
 
-        def index(values: list[int]) -> Tensor:
-            return torch.tensor(values, dtype=torch.long, device=like.device)
-
         return RoundPairs(
-            index([k for k, _, _ in ordered]),
-            index([a.body for _, a, _ in ordered]),
-            index([b.body for _, _, b in ordered]),
+            indices([k for k, _, _ in ordered], like.device),
+            indices([a.body for _, a, _ in ordered], like.device),
+            indices([b.body for _, _, b in ordered], like.device),
             like.new_tensor([[a.start, a.end, b.start, b.end] for _, a, b in ordered]),
             like.new_tensor([[a.radius, b.radius] for _, a, b in ordered]),
             slots=slots,
@@ -66,7 +66,7 @@ class RoundPairs(Finder):
     def find(self, bodies: Tensor, reach: Tensor) -> Slots:
         """See `Finder`."""
         poses = torch.stack((bodies[..., self.first, :, :], bodies[..., self.second, :, :]), -3).repeat_interleave(2, -3)
-        ends = (poses[..., :3, :3] @ self.axes[..., None]).squeeze(-1) + poses[..., :3, 3]  # [*, m, 4, 3]
+        ends = applied(poses[..., :3, :3], self.axes) + poses[..., :3, 3]  # [*, m, 4, 3]
         a, b, c, d = ends.unbind(-2)
         along = _places(a, b, c, d)  # [*, m, 3]
         centers = a[..., None, :] + along[..., None] * (b - a)[..., None, :]
@@ -80,8 +80,7 @@ class RoundPairs(Finder):
         share = along.flatten(-2).gather(-1, order)[..., None]
         axis = self.axes[which]
         solid = replaced(_TEMPLATE, start=axis[..., 2, :], end=axis[..., 3, :], radius=self.radii[which][..., 1])
-        second = bodies[..., self.second, :3, :]
-        seen = (second[..., None, :, :3].mT @ (centers - second[..., None, :, 3])[..., None]).squeeze(-1)
+        seen = in_frames(bodies[..., self.second, :3, :][..., None, :, :], centers)
         seen = seen.flatten(-3, -2).take_along_dim(order[..., None].expand(*order.shape, 3), -2)
         surface = Tangent.before(solid, seen, moves.squeeze(-1).gather(-1, which), 2 * self.radii[which][..., 1])
         return Slots(
@@ -100,25 +99,20 @@ class RoundPairs(Finder):
 _TEMPLATE = SegmentSurface(torch.zeros(1, 3), torch.zeros(1, 3), torch.ones(1))
 
 
-def _share(numerator: Tensor, square: Tensor) -> Tensor:
-    """numerator/square in [0, 1], 0 where the square is."""
-    return (numerator / torch.where(square > 0, square, torch.ones_like(square))).clamp(0, 1)
-
-
 def _places(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     """Where on the segment ab, as shares of it `[*, 3]`: the point nearest to the segment cd, and the two ends of what lies beside
     cd."""
     u, v, w = b - a, d - c, a - c
-    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
-    s = _share(uv * vw - vv * uw, uu * vv - uv * uv)
-    t = _share(vw + s * uv, vv)
-    s = _share(t * uv - uw, uu)
-    beside = [_share(dot(point - a, u), uu) for point in (c, d)]
+    uu, uv, vv, uw, vw = (dot_of_rows(x, y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    s = share_of(uv * vw - vv * uw, uu * vv - uv * uv)
+    t = share_of(vw + s * uv, vv)
+    s = share_of(t * uv - uw, uu)
+    beside = [share_of(dot_of_rows(point - a, u), uu) for point in (c, d)]
     return torch.stack((s, *beside), -1)
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
     """Distances of points from segments, `[*]`."""
     along = end - start
-    share = _share(dot(points - start, along), dot(along, along))
+    share = share_of(dot_of_rows(points - start, along), dot_of_rows(along, along))
     return torch.linalg.vector_norm(points - start - share[..., None] * along, dim=-1)

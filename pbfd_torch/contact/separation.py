@@ -22,7 +22,9 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
+from pbfd_torch.contact.segments import share_of
 from pbfd_torch.tensors.plain import plain
+from pbfd_torch.tensors.vectors import axis, dot, rotated
 
 _DEEPER = 0.05  # a face is taken where its depth is at most this share larger than the smallest …
 _SLACK = 1e-4  # … or its separation at most this share of the smaller body's size less than the largest
@@ -39,11 +41,6 @@ class Separation:
     distance: Tensor
 
 
-def rotated(rotation: Tensor, vector: Tensor) -> Tensor:
-    """R v, `[*, 3, 3], [*, 3] → [*, 3]`; row by row the same in any batch."""
-    return (rotation * vector[..., None, :]).sum(-1)
-
-
 def relative_pose(base: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     """Rotation `[K, 3, 3]` and translation `[K, 3]` that take the frame of `pose` to the frame of `base` (both `[K, 3 or 4,
     4]`)."""
@@ -52,12 +49,11 @@ def relative_pose(base: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, rotated(turn, pose[..., :3, 3] - base[..., :3, 3])
 
 
-def unit(vector: Tensor) -> Tensor:
+def _direction(vector: Tensor) -> Tensor:
     """Vectors `[*, 3]` scaled to unit length; (0, 0, 1), a direction like any other, for those that are too short for it."""
-    square = (vector * vector).sum(-1, keepdim=True)
+    square = dot(vector, vector)[..., None]
     short = ~(square > torch.finfo(vector.dtype).tiny * 1e6)  # NaN counts as short
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=vector.dtype, device=vector.device)
-    return torch.where(short, z, vector / torch.where(short, 1.0, square).sqrt())
+    return torch.where(short, axis(2, vector), vector / torch.where(short, 1.0, square).sqrt())
 
 
 def box_separation(table: PolytopeTable, a: Tensor, b: Tensor, pose_a: Tensor, pose_b: Tensor) -> Separation:
@@ -123,7 +119,7 @@ class _Pair:
         """The largest separation over the faces of both and other directions `[K, C, 3]` in the frame of b, of any sign and
         length."""
         table, a, b = self.table, self.a, self.b
-        others = unit(others)
+        others = _direction(others)
         radii = table.radius[a] + table.radius[b]
         normals_a, normals_b = table.normals[a], table.normals[b]
         faces = torch.cat(
@@ -167,8 +163,8 @@ def _clamped(points: Tensor, half: Tensor) -> Tensor:
 def _crosses(edges_a: Tensor, edges_b: Tensor) -> Tensor:
     """Unit vectors perpendicular to each pair of edges, `[K, m, 3], [K, n, 3] → [K, m n, 3]`; zero where they are almost
     parallel."""
-    cross = torch.linalg.cross(unit(edges_a)[:, :, None], unit(edges_b)[:, None]).flatten(1, 2)
-    square = (cross * cross).sum(-1, keepdim=True)
+    cross = torch.linalg.cross(_direction(edges_a)[:, :, None], _direction(edges_b)[:, None]).flatten(1, 2)
+    square = dot(cross, cross)[..., None]
     return torch.where(square > torch.finfo(cross.dtype).eps ** 0.5, cross, 0.0)
 
 
@@ -176,11 +172,9 @@ def _edges_near(point: Tensor, vertices: Tensor, edges: Tensor) -> Tensor:
     """Vectors along the edges nearest to a point, `[K, 3], [K, V, 3], [K, E, 2] → [K, ≤ 4, 3]`."""
     start, end = (vertices.gather(1, edges[..., k, None].expand(-1, -1, 3)) for k in (0, 1))
     along = end - start
-    square = (along * along).sum(-1)
     to_point = point[:, None] - start
-    share = ((to_point * along).sum(-1) / torch.where(square > 0, square, 1.0)).clamp(0, 1)
-    beside = to_point - share[..., None] * along
-    nearest = (beside * beside).sum(-1).topk(min(_NEAR_EDGES, edges.shape[1]), largest=False).indices
+    beside = to_point - share_of(dot(to_point, along), dot(along, along))[..., None] * along
+    nearest = dot(beside, beside).topk(min(_NEAR_EDGES, edges.shape[1]), largest=False).indices
     return along.gather(1, nearest[..., None].expand(-1, -1, 3))
 
 

@@ -11,7 +11,6 @@ import itertools
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import solve_banded
 from torch import Tensor
 
 
@@ -19,6 +18,8 @@ def coefficients_through(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coefficients `[n₁ + 2, n₂ + 2, …]` of the spline that takes the values `[n₁, n₂, …]`, nᵢ ≥ 2, at the nodes: one for each node
     and one beyond each border. The spline is natural (no second derivative across a border): samples of a linear function give it
     exactly; others, to fourth order in the spacing inside and to second order within a few cells of the border."""
+    from scipy.linalg import solve_banded  # takes .2 s, and few scenes need it
+
     for axis in range(values.ndim):
         y = np.moveaxis(values, axis, 0)
         c = np.empty((len(y) + 2, *y.shape[1:]))

@@ -10,6 +10,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import applied, dot, in_frames, outer, rows
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
@@ -53,7 +54,7 @@ class Field:
             return self.curvature
         across = self.curvature / self.steepness[..., None, None]
         n = self.direction
-        return across - n[..., :, None] * (n[..., None] * across).sum(-2, keepdim=True)
+        return across - outer(n, rows(n, across))
 
 
 class Surface(Protocol):
@@ -78,7 +79,7 @@ class Plane:
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
-        distance = (points * self.normal).sum(-1) - self.offset
+        distance = dot(points, self.normal) - self.offset
         return Field(distance, self.normal.expand_as(points), None)
 
     def take(self, worlds: Worlds) -> Self:
@@ -96,10 +97,9 @@ class Placed:
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         turn = self.frame[..., :3]
-        inside = self.solid.field((turn.mT @ (points - self.frame[..., 3])[..., None]).squeeze(-1))
-        normal = (turn @ inside.normal[..., None]).squeeze(-1)
+        inside = self.solid.field(in_frames(self.frame, points))
         curvature = None if inside.flat else lambda: turn @ inside.curvature @ turn.mT
-        return Field(inside.distance, normal, curvature, inside.steepness is None)
+        return Field(inside.distance, applied(turn, inside.normal), curvature, inside.steepness is None)
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
@@ -125,12 +125,12 @@ class Tangent:
         start = solid.field(points)
         normal = start.direction
         past = (start.distance > 0) & (moves > start.distance + 0.5 * thickness)
-        return Tangent(solid, past, normal, (points * normal).sum(-1) - start.distance)
+        return Tangent(solid, past, normal, dot(points, normal) - start.distance)
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         own, where = self.solid.field(points), self.where[..., None]
-        distance = torch.where(self.where, (points * self.normal).sum(-1) - self.offset, own.distance)
+        distance = torch.where(self.where, dot(points, self.normal) - self.offset, own.distance)
         normal = torch.where(where, self.normal, own.direction)
         return Field(distance, normal, lambda: torch.where(where[..., None], 0.0, own.bend))
 

@@ -18,7 +18,7 @@ from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.solvers.descent import Descent, renewed
 from pbfd_torch.solvers.lock_step import FEWEST_LANES, solution
-from pbfd_torch.solvers.objective import FALLBACKS, Solution, unsolved_worlds
+from pbfd_torch.solvers.objective import FALLBACKS, Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import Worlds
@@ -131,7 +131,7 @@ class AsynchronousRollout:
         advanced, refusal = integrator.advance(self._objective, self._state, self._progress.q)
         advanced = mapped(lambda x: x[index], advanced)
         refused = None if refusal is None else refusal()[index]
-        if len(unsolved_worlds(found)) or (refused is not None and bool(refused.any())):
+        if len(found.unsolved) or (refused is not None and bool(refused.any())):
             part = self._stepper.take(lanes)
             objective = self._objective.take(index)
             advanced, found, _ = part.finished(objective, state, held, found, advanced, refused)

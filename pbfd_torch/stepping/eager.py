@@ -19,7 +19,7 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
-from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status, unsolved_worlds
+from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Detour, Way
 from pbfd_torch.stepping.worlds import put
@@ -174,7 +174,7 @@ class EagerStepper(Generic[S]):
         if refused is not None:
             status = torch.where(refused & solution.solved, int(Status.STALLED), solution.status)
             solution = dataclasses.replace(solution, status=status.to(torch.int32))
-        index = unsolved_worlds(solution)  # the only question of a step that is solved: a device makes the host wait for it
+        index = solution.unsolved  # the only question of a step that is solved: a device makes the host wait for it
         if len(index) == 0:
             return advanced, solution, Way(solution.q, (), objective)
         easier = self.integrator.easier
@@ -189,7 +189,7 @@ class EagerStepper(Generic[S]):
                 advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2)
                 detours.append(detour)
         for k, scheme in enumerate(easier):
-            index = unsolved_worlds(solution)
+            index = solution.unsolved
             if len(index) == 0:
                 break
             # detours for the last one only: what comes before is tried for its accuracy
@@ -197,7 +197,7 @@ class EagerStepper(Generic[S]):
             advanced, solution, detour = self._eased(state, control, advanced, solution, index, scheme, solver)
             detours.append(detour)
         for halvings in range(1, self.halvings + 1):
-            index = unsolved_worlds(solution)
+            index = solution.unsolved
             if len(index) == 0 or not self._may_halve(halvings):
                 break
             advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2**halvings)

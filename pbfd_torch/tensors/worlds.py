@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from torch import Tensor
 
+from pbfd_torch.tensors.facts import known
+
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
@@ -29,10 +31,12 @@ class Worlds:
     @overload
     def pick(self, value: Tensor, rank: int) -> Tensor: ...
     @overload
-    def pick(self, value: float | Tensor, rank: int) -> float | Tensor: ...
-    def pick(self, value: float | Tensor, rank: int) -> float | Tensor:
+    def pick(self, value: float, rank: int) -> float: ...
+    @overload
+    def pick(self, value: None, rank: int) -> None: ...
+    def pick(self, value: float | Tensor | None, rank: int) -> float | Tensor | None:
         """Rows `[n, *event]` of a value `[*, *event]` whose last `rank` dimensions are its own and whose leading ones broadcast to
-        the batch. A number, or a value without leading dimensions, is one for all worlds: it comes back itself."""
+        the batch. A number, None, or a value without leading dimensions is one for all worlds: it comes back itself."""
         if not isinstance(value, Tensor) or value.ndim <= rank:
             return value
         event = value.shape[value.ndim - rank :]
@@ -45,10 +49,11 @@ class Worlds:
 
 def replaced(instance: Instance, **changes: Any) -> Instance:
     """A copy of a frozen dataclass with some fields changed: `__post_init__` does not run, its checks being done, and cached
-    properties are left behind. The instance itself where no field changes identity."""
+    properties are left behind, but for every `Fact` whose fields stay the same. The instance itself where no field changes
+    identity."""
     if all(getattr(instance, name) is value for name, value in changes.items()):
         return instance
-    fields = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)}
+    fields = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)} | changes
     copy = object.__new__(type(instance))
-    vars(copy).update(fields | changes)
+    vars(copy).update(fields | known(instance, fields))
     return copy

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
 from pbfd_torch.terms.load import JointLoad, StepContext
@@ -97,7 +98,7 @@ class Actuators:
             return torch.tensor(values, dtype=articulation.dtype, device=articulation.device)
 
         def index(starts: Sequence[int]) -> Tensor:
-            return torch.tensor([starts[j] for j in joints], dtype=torch.long, device=articulation.device)
+            return indices([starts[j] for j in joints], articulation.device)
 
         return Actuators(
             names=tuple(a.name for a in actuators),
@@ -137,7 +138,7 @@ class Actuators:
             damping=worlds.pick(self.damping, 1),
             control_range=worlds.pick(self.control_range, 2),
             force_range=worlds.pick(self.force_range, 2),
-            share=None if self.share is None else worlds.pick(self.share, 1),
+            share=worlds.pick(self.share, 1),
         )
 
     def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:

@@ -9,9 +9,7 @@ turns with both of them. With what a constant force on a material point has (MET
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -22,18 +20,15 @@ from torch import Tensor
 from pbfd_torch.contact.candidates import Finder, Slots
 from pbfd_torch.contact.hazards import Hazard, Overflow
 from pbfd_torch.contact.obstacle import Carrier
+from pbfd_torch.contact.surface import Placed
 from pbfd_torch.errors import ContactOverflowError
+from pbfd_torch.tensors.vectors import applied, extended, in_frames, mapped, outer
 from pbfd_torch.tensors.worlds import Worlds, replaced
-from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.checks import require_non_negative, require_positive
-from pbfd_torch.terms.contact import ContactPoints
+from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
-from pbfd_torch.terms.friction_law import FrictionLaw
-from pbfd_torch.terms.lagged_friction import lagged_law, widened_law
 from pbfd_torch.terms.load import LinkLoad, StepContext
-from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.terms.restitution import Restitution
-from pbfd_torch.terms.touching import ContactForce, Touching, extended, mapped, outer
+from pbfd_torch.terms.touching import ContactForce, Touching
 from pbfd_torch.tree.kinematics import Motion, Placement
 from pbfd_torch.tree.rotations import rotation_log, skew
 
@@ -41,43 +36,39 @@ _FAR = 1e6  # [m] how far an empty slot is from everything
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedBodyContact:
-    dt: Tensor  # [*batch, 1]
+class PreparedBodyContact(Prepared):
     slots: Slots
-    grip: Tensor  # [*batch, n] μ
     bodies: Tensor  # [*batch, nbody, 4, 4] at the start
     reach: Tensor  # [*batch, nbody] how far they may move without a candidate being missed
     obstacles: Tensor  # [*batch, nobstacle, 4, 4] at the end
     start: Tensor  # [*batch, n, 3] where the points were in the frames of the solids
     turned: Tensor  # [*batch, n, 3, 3] how their bodies stood in the frames of the solids
     anchor: Tensor | None  # [*batch, n, 3] what the anchors are behind by in the frames of the solids
-    bounce: Tensor | None  # [*batch, n] how far the surfaces are moved out to throw a point back
-    depth: Tensor | None  # [*batch, n] of the points at the start, where the normal force lets go
+
+    def standing(self, placement: Placement) -> Tensor:
+        """Where the bodies are at a placement that ends the step, `[*batch, nbody, 4, 4]`."""
+        links = placement.poses
+        return torch.cat((links, self.obstacles.expand(*links.shape[:-3], *self.obstacles.shape[-3:])), -3)
 
 
 @dataclass(frozen=True, eq=False)
-class BodyContact:
-    """Candidates between bodies, found anew in every step.
+class BodyContact(ContactLaws[PreparedBodyContact]):
+    """Candidates between bodies, found anew in every step, which act by `ContactLaws`; the friction is that for μ = 1.
 
     Attributes:
         finder: what finds them.
         obstacles: the bodies that are no links, numbered after these.
         extent: `[nbody]` distance from a body's origin to its farthest collider point [m].
-        normal_force: Eq. 8.
-        friction: the tangential law for μ = 1, or None; `grip`: `[npair]` the μ of every pair of colliders.
-        restitution: how much of the speed of an impact comes back; None: nothing.
-        overflow: what to do where more is near than there are slots.
+        grip: `[npair]` the μ of every pair of colliders.
         slack: [m] how much further than its free motion and half as far again a body may go without a candidate being missed, and
             how far bodies may overlap at the start of a step without a `Hazard`.
+        overflow: what to do where more is near than there are slots.
     """
 
     finder: Finder
     obstacles: tuple[Carrier, ...]
     extent: Tensor
-    normal_force: NormalForce
-    friction: FrictionLaw | None
     grip: Tensor
-    restitution: Restitution | None = None
     slack: float = 0.01
     overflow: Overflow = Overflow.FLAG
 
@@ -87,12 +78,7 @@ class BodyContact:
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact of some worlds."""
-        return replaced(
-            self,
-            obstacles=tuple(x.take(worlds) for x in self.obstacles),
-            normal_force=self.normal_force.take(worlds),
-            friction=None if self.friction is None else self.friction.take(worlds),
-        )
+        return replaced(super().take(worlds), obstacles=tuple(x.take(worlds) for x in self.obstacles))
 
     def _standing(self, like: Tensor, time: Tensor) -> Tensor:
         """Where the obstacles are, `[*batch, nobstacle, 4, 4]`, for as many worlds as link poses have."""
@@ -100,17 +86,13 @@ class BodyContact:
         poses = [x.pose(time).expand(*batch, 4, 4) for x in self.obstacles]
         return torch.stack(poses, -3) if poses else like[..., :0, :, :]
 
-    def prepare(self, step: StepContext) -> PreparedBodyContact:
-        return self.recall(step, self.memory(step.target_q.shape[:-1]))
-
     def memory(self, batch: tuple[int, ...]) -> Tensor:
         """What the anchors know of each slot: what they are behind by, where its point is, and its pair (−1: none),
         `[*batch, n, 7]`; without anchors nothing."""
-        count = self.finder.slots if isinstance(self.friction, AnchoredFriction) else 0
-        return self.extent.new_full((*batch, count, 7), -1.0)
+        return self.extent.new_full((*batch, self.finder.slots if self._anchors else 0, 7), -1.0)
 
     def recall(self, step: StepContext, memory: Tensor) -> PreparedBodyContact:
-        """`prepare` with what the anchors were behind by at the end of the last step."""
+        """See `ContactLaws`."""
         links, target = step.previous.poses, step.target_poses
         obstacles = self._standing(links, step.time + step.dt)
         bodies = torch.cat((links, self._standing(links, step.time)), -3)
@@ -119,26 +101,36 @@ class BodyContact:
             reach = 1.5 * self._travel(bodies, ahead) + self.slack
         slots = self._found(bodies, reach)
         first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
-        turn = second[..., :3].mT
-        start = (turn @ (mapped(first, slots.position) - second[..., 3])[..., None]).squeeze(-1)
-        start = start + step.dt[..., None, None] * self._running(slots, turn @ first[..., :3])
-        anchor = _inherited(memory, slots) if isinstance(self.friction, AnchoredFriction) else None
+        turned = second[..., :3].mT @ first[..., :3]
+        start = in_frames(second, mapped(first, slots.position)) + step.dt[..., None, None] * self._running(slots, turned)
         dt = step.dt[..., None]
-        gap, bounce = _gaps(slots, bodies), None
-        if self.restitution is not None:
-            coasting = torch.cat((step.coasting_poses, obstacles), -3)
-            bounce = self.restitution.bounce(gap, _gaps(slots, ahead), dt, _gaps(slots, coasting))
-        depth = -gap if math.isfinite(self.normal_force.release) else None
-        grip = self.grip[slots.pair]
-        return PreparedBodyContact(dt, slots, grip, bodies, reach, obstacles, start, turn @ first[..., :3], anchor, bounce, depth)
+        depth, bounce = self._beginning(
+            dt,
+            lambda: _gaps(slots, bodies),
+            lambda: _gaps(slots, ahead),
+            lambda: _gaps(slots, torch.cat((step.coasting_poses, obstacles), -3)),
+        )
+        return PreparedBodyContact(
+            slots=slots,
+            bodies=bodies,
+            reach=reach,
+            obstacles=obstacles,
+            start=start,
+            turned=turned,
+            anchor=_inherited(memory, slots) if self._anchors else None,
+            dt=dt,
+            grip=self.grip[slots.pair],
+            depth=depth,
+            bounce=bounce,
+        )
 
     def _running(self, slots: Slots, turned: Tensor) -> Tensor:
         """Velocity of belts at the slots as their solids see it, `[*batch, n, 3]`: the solids' less the points'."""
-        if not self.obstacles:
+        if not any(any(x.motion.belt) for x in self.obstacles):
             return torch.zeros_like(slots.position)
         still = self.extent.new_zeros((len(self.extent) - len(self.obstacles), 3))
         belt = torch.cat((still, torch.stack([x.belt for x in self.obstacles])))
-        return belt[slots.second] - (turned @ belt[slots.first][..., None]).squeeze(-1)
+        return belt[slots.second] - applied(turned, belt[slots.first])
 
     def _found(self, bodies: Tensor, reach: Tensor) -> Slots:
         finder = self.finder
@@ -163,8 +155,7 @@ class BodyContact:
 
     def hazards(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
         """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
-        after = torch.cat((placement.poses, prepared.obstacles), -3)
-        far = (self._travel(prepared.bodies, after) > prepared.reach).any(-1)
+        far = (self._travel(prepared.bodies, prepared.standing(placement)) > prepared.reach).any(-1)
         slots = prepared.slots
         overlapped = (slots.filled & (_gaps(slots, prepared.bodies) < -self.slack)).any(-1)
         found = {Hazard.CANDIDATES_DROPPED: slots.dropped, Hazard.MOVED_TOO_FAR: far, Hazard.OVERLAPPED: overlapped}
@@ -173,47 +164,31 @@ class BodyContact:
     def remembered(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
         """What the anchors know after a step that ended at a placement; see `memory`."""
         slots = prepared.slots
-        if not isinstance(self.friction, AnchoredFriction):
+        if not self._anchors:
             return prepared.start.new_zeros((*prepared.start.shape[:-2], 0, 7))
-        at, frame = self._touching(prepared, placement)
-        kept = (frame[..., :3].mT @ self.friction.kept(at.slip, at.depth)[..., None]).squeeze(-1)
+        at, frame = self.touching(prepared, placement), _of_slots(prepared.standing(placement), slots.second)
+        kept = applied(frame[..., :3].mT, self._anchors.kept(at.slip, at.depth))
         pair = torch.where(slots.filled & (at.depth > 0), slots.pair, -1).to(kept.dtype)
         return torch.cat((kept, slots.position, pair[..., None]), -1)[..., : self.finder.slots, :]
 
-    def _touching(self, prepared: PreparedBodyContact, placement: Placement) -> tuple[Touching, Tensor]:
-        """Where the candidates are at a placement, and the frames of the solids `[*batch, n, 3, 4]`."""
-        slots = prepared.slots
-        obstacles = prepared.obstacles.expand(*placement.poses.shape[:-3], *prepared.obstacles.shape[-3:])
-        bodies = torch.cat((placement.poses, obstacles), -3)
+    def touching(self, prepared: PreparedBodyContact, placement: Placement) -> Touching:
+        """See `ContactLaws`."""
+        slots, bodies = prepared.slots, prepared.standing(placement)
         first, frame = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
-        centers, turn = mapped(first, slots.position), frame[..., :3]
-        field = slots.surface.field((turn.mT @ (centers - frame[..., 3])[..., None]).squeeze(-1))
+        centers = mapped(first, slots.position)
+        field = Placed(slots.surface, frame).field(centers)
         start = prepared.start if prepared.anchor is None else prepared.start - prepared.anchor
-        depth = slots.radius - field.distance
-        if prepared.bounce is not None:
-            depth = depth + prepared.bounce
-        rolled = rotation_log(first[..., :3] @ (turn @ prepared.turned).mT)
-        return (
-            Touching(
-                centers=centers,
-                normal=(turn @ field.direction[..., None]).squeeze(-1),
-                depth=torch.where(slots.filled, depth, -_FAR),
-                moved=centers - mapped(frame, start),
-                radius=slots.radius,
-                turn=rolled,
-                bend=None if field.flat else lambda: turn @ field.bend @ turn.mT,
-                steepness=field.steepness,
-            ),
-            frame,
+        depth = prepared.raised(slots.radius - field.distance)
+        return Touching(
+            centers=centers,
+            normal=field.direction,
+            depth=torch.where(slots.filled, depth, -_FAR),
+            moved=centers - mapped(frame, start),
+            radius=slots.radius,
+            turn=rotation_log(first[..., :3] @ (frame[..., :3] @ prepared.turned).mT),
+            bend=None if field.flat else lambda: field.bend,
+            steepness=field.steepness,
         )
-
-    def force(self, prepared: PreparedBodyContact, placement: Placement) -> ContactForce:
-        """The forces on the first bodies at a placement that ends the prepared step."""
-        at, _ = self._touching(prepared, placement)
-        law = self.normal_force
-        if self.restitution is not None and prepared.bounce is not None:
-            law = self.restitution.stiffened(law, prepared.bounce)
-        return ContactForce(at, law.during(prepared.depth, prepared.dt), self.friction, prepared.dt, prepared.grip)
 
     def load(self, prepared: PreparedBodyContact, placement: Placement) -> LinkLoad:
         slots, contact = prepared.slots, self.force(prepared, placement)
@@ -242,37 +217,6 @@ class BodyContact:
         outlook = functools.partial(_outlook, slots, len(self.obstacles), contact)
         return LinkLoad(moment, stiffness, coupling, outlook)
 
-    def energy(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
-        """As `Contact.energy`."""
-        return self.force(prepared, placement).energy().sum(-1)
-
-    def lagged(self, prepared: PreparedBodyContact, placement: Placement) -> Self:
-        """As `Contact.lagged`."""
-        contact = self.force(prepared, placement)
-        return replaced(self, friction=lagged_law(self.friction, contact.push, contact.at.depth))
-
-    def widened(self, factor: float) -> Self:
-        """As `Contact.widened`."""
-        return replaced(self, friction=widened_law(self.friction, factor))
-
-    def seen_from(self, distance: float) -> Self:
-        """See `Foreboding`."""
-        return replaced(self, normal_force=self.normal_force.seen_from(distance))
-
-    def softened(self, factor: float) -> BodyContact:
-        """As `Contact.softened`."""
-        return dataclasses.replace(self, normal_force=self.normal_force.scaled(factor))
-
-    def push(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
-        """See `Pushing`."""
-        return self.force(prepared, placement).push.sum(-1)
-
-    def points(self, prepared: PreparedBodyContact, placement: Placement) -> ContactPoints:
-        """The contacts at a placement that ends the prepared step; forces are on the first bodies."""
-        contact = self.force(prepared, placement)
-        at = contact.at
-        return ContactPoints(at.points, at.depth, at.normal, contact.force, at.slip)
-
 
 def _of_slots(bodies: Tensor, index: Tensor) -> Tensor:
     """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`; either may be that of one world for all."""
@@ -291,18 +235,17 @@ def _outlook(slots: Slots, obstacles: int, contact: ContactForce, motion: Motion
 
     first, second = ([of_slots(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
     velocity = mapped(first[0] - second[0], at.centers)
-    carried = 2 * (second[0][..., :3] @ velocity[..., None]).squeeze(-1)  # Coriolis: seen from a turning body
+    carried = 2 * applied(second[0][..., :3], velocity)  # Coriolis: seen from a turning body
     acceleration = mapped(first[1] - second[1], at.centers) - carried
     out = slots.radius[..., None] * at.normal
     spin = first[0][..., :3] - second[0][..., :3]
-    return contact_outlook(contact, velocity - (spin @ out[..., None]).squeeze(-1), acceleration)
+    return contact_outlook(contact, velocity - applied(spin, out), acceleration)
 
 
 def _gaps(slots: Slots, bodies: Tensor) -> Tensor:
     """How far the points are from the solids [m] `[*batch, n]`."""
     first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
-    seen = (second[..., :3].mT @ (mapped(first, slots.position) - second[..., 3])[..., None]).squeeze(-1)
-    return slots.surface.field(seen).distance - slots.radius
+    return Placed(slots.surface, second).field(mapped(first, slots.position)).distance - slots.radius
 
 
 def _turning(contact: ContactForce) -> tuple[Tensor, Tensor]:

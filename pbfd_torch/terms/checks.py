@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -12,9 +13,7 @@ from pbfd_torch.errors import InputError
 
 def require_non_negative(what: str, value: float | Tensor, unit: str = "") -> None:
     """Raises `InputError` unless every entry is finite and ≥ 0."""
-    entries = torch.as_tensor(value)
-    if not bool((torch.isfinite(entries) & (entries >= 0)).all()):
-        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be ≥ 0 and finite")
+    _require(what, value, unit, lambda x: x >= 0, "≥ 0")
 
 
 def require_widening(factor: float) -> None:
@@ -25,6 +24,10 @@ def require_widening(factor: float) -> None:
 
 def require_positive(what: str, value: float | Tensor, unit: str = "") -> None:
     """Raises `InputError` unless every entry is finite and > 0."""
+    _require(what, value, unit, lambda x: x > 0, "> 0")
+
+
+def _require(what: str, value: float | Tensor, unit: str, fits: Callable[[Tensor], Tensor], where: str) -> None:
     entries = torch.as_tensor(value)
-    if not bool((torch.isfinite(entries) & (entries > 0)).all()):
-        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be > 0 and finite")
+    if not bool((torch.isfinite(entries) & fits(entries)).all()):
+        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be {where} and finite")

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import dot, rotated
 from pbfd_torch.terms.friction_law import Lifting
-from pbfd_torch.terms.touching import ContactForce, dot
+from pbfd_torch.terms.touching import ContactForce
 
 
 def contact_outlook(force: ContactForce, velocity: Tensor, acceleration: Tensor) -> Callable[[Tensor], Tensor]:
@@ -26,7 +27,7 @@ def contact_outlook(force: ContactForce, velocity: Tensor, acceleration: Tensor)
         size, along, square = dot(slip, slip), dot(slip, first), dot(first, first) + dot(slip, second)
         cube, fourth = dot(first, second), dot(second, second)
     if at.bend is not None:
-        faster = faster - ((at.bend() * velocity[..., None, :]).sum(-1) * velocity).sum(-1)
+        faster = faster - dot(rotated(at.bend(), velocity), velocity)
 
     def work(length: Tensor) -> Tensor:
         a = length[..., None]

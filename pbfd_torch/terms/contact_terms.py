@@ -27,6 +27,7 @@ from pbfd_torch.contact.polytope_pairs import POINTS, PolytopePairs
 from pbfd_torch.contact.round_pairs import Round, RoundPairs
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.constants import indices
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -159,11 +160,17 @@ class _Builder:
         carriers = tuple(x.carrier(self.articulation.dtype, self.articulation.device) for x in solids)
         return [
             BodyContact(
-                finder, carriers, extent.to(mu), self.normal_force, self.rules.friction, mu, self.rules.restitution,
+                finder=finder,
+                obstacles=carriers,
+                extent=extent.to(mu),
+                grip=mu,
                 overflow=self.rules.overflow,
+                normal_force=self.normal_force,
+                friction=self.rules.friction,
+                restitution=self.rules.restitution,
             )
             for finder in self._finders(parts, pairs)
-        ]  # fmt: skip
+        ]
 
     def _part(self, collider: Collider) -> _Part:
         turn = quaternion_matrix(torch.tensor(collider.quaternion, dtype=torch.float64))
@@ -269,13 +276,10 @@ def _extent(part: _Part) -> Tensor:
 
 
 def _ball_boxes(balls: Sequence[tuple[int, _Part, _Part]], slots: int, like: Tensor) -> BallBoxPairs:
-    def index(values: list[int]) -> Tensor:
-        return torch.tensor(values, dtype=torch.long, device=like.device)
-
     return BallBoxPairs(
-        pair=index([k for k, _, _ in balls]),
-        first=index([ball.body for _, ball, _ in balls]),
-        second=index([box.body for _, _, box in balls]),
+        pair=indices([k for k, _, _ in balls], like.device),
+        first=indices([ball.body for _, ball, _ in balls], like.device),
+        second=indices([box.body for _, _, box in balls], like.device),
         position=torch.stack([ball.frame[:3, 3] for _, ball, _ in balls]).to(like),
         radius=like.new_tensor([ball.shape.radius for _, ball, _ in balls if isinstance(ball.shape, Sphere)]),
         frame=torch.stack([box.frame[:3] for _, _, box in balls]).to(like),

@@ -7,6 +7,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import dot
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -64,7 +65,7 @@ class Storing(Protocol):
 
 def slip_size(slip: Tensor) -> Tensor:
     """‖u‖ of `[*, 3]`, with derivatives of every order at u = 0, where they are set to zero."""
-    square = (slip * slip).sum(-1)
+    square = dot(slip, slip)
     moves = square > 0
     return torch.where(moves, torch.where(moves, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
 

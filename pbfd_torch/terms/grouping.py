@@ -2,54 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.constants import indices
 
-@dataclass(frozen=True, eq=False)
+
 class Grouping:
-    """Candidates in rows, one row a link that has any. `link` `[n]`: whose each candidate is."""
+    """Candidates in rows, one row a link that has any. `link` `[n]`: whose each candidate is; the host reads it and lays the rows
+    out, so that no step has to wait for that."""
 
-    link: Tensor
-
-    @cached_property
-    def _members(self) -> list[list[int]]:
+    def __init__(self, link: Tensor) -> None:
         of_link: dict[int, list[int]] = {}
-        for k, link in enumerate(self.link.tolist()):
-            of_link.setdefault(link, []).append(k)
-        return list(of_link.values())
-
-    @cached_property
-    def _layout(self) -> tuple[Tensor, Tensor] | None:
-        """Which candidate stands where `[nrow, width]`, its first one in the places left over, and where each of them is found in
-        the flattened rows `[n]`; None: as they come."""
-        members = self._members
+        for k, owner in enumerate(link.tolist()):
+            of_link.setdefault(owner, []).append(k)
+        members = list(of_link.values())
         width = max(map(len, members))
-        if members == [list(range(k * width, (k + 1) * width)) for k in range(len(members))]:
-            return None
-        order = torch.tensor([row + [row[0]] * (width - len(row)) for row in members], device=self.link.device)
-        place = {k: i * width + j for i, row in enumerate(members) for j, k in enumerate(row)}
-        return order, torch.tensor([place[k] for k in range(len(self.link))], device=self.link.device)
-
-    @cached_property
-    def _there(self) -> Tensor:
-        """1 where a candidate stands, 0 in the places left over, `[nrow, 1, width]`."""
-        width = max(map(len, self._members))
-        there = [[1.0] * len(row) + [0.0] * (width - len(row)) for row in self._members]
-        return torch.tensor(there, device=self.link.device)[:, None]
-
-    @cached_property
-    def _links(self) -> Tensor:
-        """Whose each row is `[nrow]`."""
-        return self.link[torch.tensor([row[0] for row in self._members], device=self.link.device)]
+        self._link = link
+        self._count = len(members)
+        self._links = indices(list(of_link), link.device)  # whose each row is [nrow]
+        # 1 where a candidate stands, 0 in the places left over, [nrow, 1, width]
+        there = [[True] * len(row) + [False] * (width - len(row)) for row in members]
+        self._there = torch.tensor(there, device=link.device)[:, None]
+        self._layout = None if members == _in_turn(len(members), width) else _layout(members, width, link)
 
     def _coordinates(self, values: Tensor) -> Tensor:
         """`[*, n, k] → [*, k, nrow, width]`."""
         if self._layout is None:
-            return values.mT.unflatten(-1, (len(self._members), -1))
+            return values.mT.unflatten(-1, (self._count, -1))
         return values.mT[..., self._layout[0]]
 
     def rows(self, values: Tensor) -> Tensor:
@@ -67,7 +47,7 @@ class Grouping:
 
     def picked(self, of_links: Tensor) -> Tensor:
         """To each candidate what its link has, `[*, nlink, k] → [*, n, k]`, coordinate by coordinate in memory."""
-        return of_links.mT[..., self.link].mT
+        return of_links.mT[..., self._link].mT
 
     def products(self, left: Tensor, right: Tensor) -> Tensor:
         """Σ l rᵀ over the candidates of each of the `rows`, `[*, nrow, width, r], [*, nrow, width, c] → [*, nrow, r, c]`."""
@@ -75,7 +55,7 @@ class Grouping:
 
     def sums(self, values: Tensor) -> Tensor:
         """Sums over the candidates of each row, `[*, n, k] → [*, nrow, k]`."""
-        rows = values.unflatten(-2, (len(self._members), -1)) if self._layout is None else values[..., self._layout[0], :]
+        rows = values.unflatten(-2, (self._count, -1)) if self._layout is None else values[..., self._layout[0], :]
         there = self._there.to(rows.dtype)
         return (there.expand(*rows.shape[:-3], *there.shape) @ rows).squeeze(-2)
 
@@ -85,3 +65,16 @@ class Grouping:
         place = (torch.arange(links, device=touched.device)[:, None] == touched).to(of_rows.dtype)
         place = place.expand(*of_rows.shape[:-3], *place.shape)
         return (place @ of_rows.flatten(-2)).unflatten(-1, of_rows.shape[-2:])
+
+
+def _in_turn(count: int, width: int) -> list[list[int]]:
+    """Rows of candidates as they come."""
+    return [list(range(k * width, (k + 1) * width)) for k in range(count)]
+
+
+def _layout(members: list[list[int]], width: int, link: Tensor) -> tuple[Tensor, Tensor]:
+    """Which candidate stands where `[nrow, width]`, a row's first one in the places left over, and where each of them is found in
+    the flattened rows `[n]`."""
+    order = torch.tensor([row + [row[0]] * (width - len(row)) for row in members], device=link.device)
+    place = {k: i * width + j for i, row in enumerate(members) for j, k in enumerate(row)}
+    return order, indices([place[k] for k in range(len(link))], link.device)

@@ -14,6 +14,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import trace_minus
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.load import ChordLoad, LinkLoad, StepContext
 from pbfd_torch.tree.kinematics import Chord, Placement
@@ -62,9 +63,6 @@ class Inertia:
 def inertia_stiffness(second: Tensor) -> Tensor:
     """How the wrench on masses m at points q answers a twist of points p that they are tied to, from Σ m p̄ q̄ᵀ `[*, 4, 4]`:
     `[*, 6, 6]` in the order (ω, v). With p = q (T S Tᵀ) it is the spatial inertia about the world origin."""
-    m = second[..., :3, :3]
-    trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    eye = torch.eye(3, dtype=m.dtype, device=m.device)
-    mass = second[..., 3:, 3:] * eye
-    top = torch.cat((trace * eye - m, skew(second[..., 3, :3])), -1)
+    mass = second[..., 3:, 3:] * torch.eye(3, dtype=second.dtype, device=second.device)
+    top = torch.cat((trace_minus(second[..., :3, :3]), skew(second[..., 3, :3])), -1)
     return torch.cat((top, torch.cat((-skew(second[..., :3, 3]), mass), -1)), -2)

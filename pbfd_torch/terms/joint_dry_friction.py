@@ -11,6 +11,7 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
+from pbfd_torch.terms.scalar_coordinates import scalar_coordinates
 from pbfd_torch.tree.kinematics import Placement
 
 
@@ -33,10 +34,7 @@ class JointDryFriction:
         require_positive("slip_speed", self.slip_speed, "rad/s or m/s")
 
     def prepare(self, step: StepContext) -> PreparedDryFriction:
-        t = step.previous.articulation.topology
-        start = step.previous.q.new_zeros((*step.previous.q.shape[:-1], t.nv))
-        start[..., t.scalar_v] = step.previous.q[..., t.scalar_q]
-        return PreparedDryFriction(start, step.dt[..., None])
+        return PreparedDryFriction(scalar_coordinates(step.previous), step.dt[..., None])
 
     def load(self, prepared: PreparedDryFriction, placement: Placement) -> JointLoad:
         moved = _moved(prepared, placement)
@@ -66,7 +64,4 @@ class JointDryFriction:
 
 def _moved(prepared: PreparedDryFriction, placement: Placement) -> Tensor:
     """Displacement of each hinge and slide over the step `[*batch, nv]`, 0 for other degrees of freedom."""
-    t = placement.articulation.topology
-    moved = placement.q.new_zeros((*placement.q.shape[:-1], t.nv))
-    moved[..., t.scalar_v] = placement.q[..., t.scalar_q] - prepared.start[..., t.scalar_v]
-    return moved
+    return scalar_coordinates(placement) - prepared.start

@@ -13,6 +13,7 @@ from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.release import NormalLaw, require_release
+from pbfd_torch.terms.scalar_coordinates import scalar_coordinates
 from pbfd_torch.tree.articulation import Articulation, force_scale, lever
 from pbfd_torch.tree.kinematics import Placement
 
@@ -88,9 +89,6 @@ class JointLimits:
 
 def _depths(placement: Placement) -> tuple[Tensor, Tensor]:
     """How far each coordinate is below its lower and above its upper limit, < 0 within the range, −1 at least, `[*batch, nv]`."""
-    articulation = placement.articulation
-    t = articulation.topology
-    x = placement.q.new_zeros((*placement.q.shape[:-1], articulation.nv))
-    x[..., t.scalar_v] = placement.q[..., t.scalar_q]
+    articulation, x = placement.articulation, scalar_coordinates(placement)
     # what has no limit is infinitely far from it, which autograd does not survive
     return (articulation.lower - x).clamp_min(-1.0), (x - articulation.upper).clamp_min(-1.0)

@@ -107,8 +107,8 @@ class JointSprings(_Pull):
 
     def take(self, worlds: Worlds) -> Self:
         """The same springs with the values of some worlds."""
-        share = None if self.share is None else worlds.pick(self.share, 1)
-        return replaced(self, stiffness=worlds.pick(self.stiffness, 1), rest=worlds.pick(self.rest, 1), share=share)
+        stiffness, rest, share = (worlds.pick(x, 1) for x in (self.stiffness, self.rest, self.share))
+        return replaced(self, stiffness=stiffness, rest=rest, share=share)
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Stored energy [J] `[*batch]`."""

@@ -59,11 +59,11 @@ class StepContext:
             weight=worlds.pick(self.weight, 0),
             target_poses=worlds.pick(self.target_poses, 3),
             target_q=worlds.pick(self.target_q, 1),
-            control=None if self.control is None else worlds.pick(self.control, 1),
+            control=worlds.pick(self.control, 1),
             time=worlds.pick(self.time, 0),
             gravity=worlds.pick(self.gravity, 1),
-            share=None if self.share is None else worlds.pick(self.share, 0),
-            guess=None if self.guess is None else worlds.pick(self.guess, 1),
+            share=worlds.pick(self.share, 0),
+            guess=worlds.pick(self.guess, 1),
         )
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import extended, outer, rotated
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.tree.articulation import Articulation
@@ -44,8 +45,7 @@ class Pushes:
 
     def _moment(self, poses: Tensor) -> Tensor:
         """−f p̄ᵀ `[*batch, nlink, 3, 4]`."""
-        place = (poses[..., :3, :3] * self.point[..., None, :]).sum(-1) + poses[..., :3, 3]
-        return -self.force[..., None] * torch.cat((place, torch.ones_like(place[..., :1])), -1)[..., None, :]
+        return -outer(self.force, extended(rotated(poses[..., :3, :3], self.point) + poses[..., :3, 3]))
 
     def load(self, prepared: None, placement: Placement) -> LinkLoad:
         poses = placement.poses

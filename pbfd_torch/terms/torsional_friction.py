@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.vectors import dot, outer, rows
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.contact import Contact, PreparedContact
 from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
-from pbfd_torch.terms.grouping import Grouping
 from pbfd_torch.terms.load import LinkLoad, StepContext
-from pbfd_torch.terms.touching import Touching, outer, rows, shifting
+from pbfd_torch.terms.touching import Touching, shifting
 from pbfd_torch.tree.kinematics import Placement
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
 
@@ -49,10 +49,6 @@ class TorsionalFriction:
             raise InputError("no candidate of the contact has a radius: torsional friction needs a sphere or a capsule")
 
     @cached_property
-    def _grouping(self) -> Grouping:
-        return Grouping(self.contact.link)
-
-    @cached_property
     def _arm(self) -> Tensor:
         """ℓ μ of the rounded candidates, 0 for points, `[*, npoint]` [m]."""
         return self.mu * self.patch * (self.contact.radius > 0).to(self.contact.radius.dtype)
@@ -67,7 +63,7 @@ class TorsionalFriction:
             contact=self.contact.take(worlds),
             mu=worlds.pick(self.mu, 1),
             patch=worlds.pick(self.patch, 1),
-            held=None if self.held is None else worlds.pick(self.held, 1),
+            held=worlds.pick(self.held, 1),
         )
 
     def _at(self, prepared: PreparedContact, placement: Placement) -> tuple[Touching, Tensor, Tensor, Tensor, Tensor]:
@@ -78,11 +74,11 @@ class TorsionalFriction:
             push, slope = self.held, torch.zeros_like(slope)
         turn = force.at.turn
         assert turn is not None  # the contact is rounded
-        return force.at, turn, self._arm * push, self._arm * slope, (turn * force.at.normal).sum(-1)
+        return force.at, turn, self._arm * push, self._arm * slope, dot(turn, force.at.normal)
 
     def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         at, turn, limit, by_depth, angle = self._at(prepared, placement)
-        links, grouping = placement.poses.shape[-3], self._grouping
+        links, grouping = placement.poses.shape[-3], self.contact.grouping
         width = self.spin_speed * prepared.dt
         size = angle.abs()
         factor = slip_factor(size, width)

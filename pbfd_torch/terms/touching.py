@@ -5,9 +5,8 @@ has the direction n. Its depth is d = ρ + δ − φ(c), and its force acts at p
 m = c − c₀ − ρ ϕ × n + a (METHOD §4): c₀ is where the solid has carried the centre of the start, ϕ the rotation since then relative
 to the solid, and a what an anchor remembers. Everything is in world axes; what moves below is the body, relative to the solid.
 
-Vectors `[*, n, 3]` of many candidates are best laid out in memory coordinate by coordinate, as transposes of `[*, 3, n]`: torch is
-several times faster where neighbours in memory belong to neighbouring candidates. The functions at the end return such vectors. In
-sums the slip goes first and the normal last: torch lays a result out like its first operand, and planes have one normal for all.
+Vectors of many candidates are laid out coordinate by coordinate (`tensors.vectors`). In sums the slip goes first and the normal
+last: torch lays a result out like its first operand, and planes have one normal for all.
 """
 
 from __future__ import annotations
@@ -19,6 +18,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import cross, cross_coordinates, rows, trace_minus
+from pbfd_torch.tensors.vectors import dot as dot
+from pbfd_torch.tensors.vectors import outer as outer
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
@@ -191,9 +193,7 @@ class ContactForce:
         if at.radius is not None:  # the point of application moves with the centre, not with the surface
             arm = at.radius[..., None, None]
             pull = outer(at.normal, self.force)
-            trace = pull.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-            eye = torch.eye(3, dtype=pull.dtype, device=pull.device)
-            torque = torque + torch.cat((arm * (trace * eye - pull), torch.zeros_like(pull)), -1)
+            torque = torque + torch.cat((arm * trace_minus(pull), torch.zeros_like(pull)), -1)
             if at.bend is not None:
                 torque = torque - arm * (skew(self.force) @ at.bend() @ shifting(at.centers))
         return torch.cat((torque, answer), -2)
@@ -215,53 +215,10 @@ class ContactForce:
 
 def arm(points: Tensor, forces: Tensor) -> Tensor:
     """Wrench (p × f, f) about the world origin, `[*, 3], [*, 3] → [*, 6]`."""
-    return torch.stack((*_cross(points, forces), *forces.unbind(-1)), -2).mT
+    return torch.stack((*cross_coordinates(points, forces), *forces.unbind(-1)), -2).mT
 
 
 def shifting(points: Tensor) -> Tensor:
     """X = [−[p]× | 1], which takes a twist (ω, v) about the world origin to the velocity of a point, `[*, 3] → [*, 3, 6]`."""
     eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*points.shape, 3)
     return torch.cat((-skew(points), eye), -1)
-
-
-def extended(points: Tensor) -> Tensor:
-    """p̄ = (p, 1), `[*, 3] → [*, 4]`."""
-    return torch.cat((points.mT, torch.ones_like(points.mT[..., :1, :])), -2).mT
-
-
-def turned(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """M v, `[*, n or 1, 3, 3], [*, n, 3] → [*, n, 3]`; not by a matrix product, which is slow for so small ones."""
-    first, second, third = matrices.movedim(-3, -1).unbind(-2)
-    x, y, z = vectors.mT.split(1, -2)
-    return torch.addcmul(torch.addcmul(first * x, second, y), third, z).mT
-
-
-def mapped(matrices: Tensor, points: Tensor) -> Tensor:
-    """M p̄, `[*, n or 1, 3, 4], [*, n, 3] → [*, n, 3]`."""
-    return turned(matrices[..., :3], points) + matrices[..., 3]
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """a · b, `[*, 3], [*, 3] → [*]`."""
-    return (a * b).sum(-1)
-
-
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """a × b, `[*, n, 3], [*, n, 3] → [*, n, 3]`."""
-    return torch.stack(_cross(a, b), -2).mT
-
-
-def _cross(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The coordinates of a × b, each `[*, n]`."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-def outer(a: Tensor, b: Tensor) -> Tensor:
-    """a bᵀ, `[*, n], [*, m] → [*, n, m]`."""
-    return a[..., :, None] * b[..., None, :]
-
-
-def rows(vector: Tensor, matrix: Tensor) -> Tensor:
-    """vᵀM, `[*, n], [*, n, m] → [*, m]`; not by a matrix product, which rounds differently for one world and for many."""
-    return (vector[..., None] * matrix).sum(-2)

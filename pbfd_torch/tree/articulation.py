@@ -13,13 +13,13 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError, ModelError
+from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.rotations import quaternion_matrix, skew
 from pbfd_torch.tree.topology import Topology
@@ -166,6 +166,7 @@ class Articulation:
             if bool(torch.isnan(value).any()):
                 raise InputError(f"{name} holds NaN")
         self._check_inertia()
+        self.joint_basis()  # kept from now on: nothing of a step, which a device may record and repeat, makes it for later ones
 
     def _check_inertia(self) -> None:
         with torch.no_grad():
@@ -236,7 +237,7 @@ class Articulation:
         differentiable = torch.is_grad_enabled() and (self.joint_frame.requires_grad or self.joint_axis.requires_grad)
         return self._compute_basis() if differentiable else self._cached_basis
 
-    @cached_property
+    @fact("topology", "joint_frame", "joint_axis")
     def _cached_basis(self) -> tuple[Tensor, Tensor, Tensor]:
         with torch.no_grad():
             return self._compute_basis()
@@ -257,8 +258,9 @@ class Articulation:
 def force_scale(articulation: Articulation, gravity: float | Tensor) -> Tensor:
     """Size `[*, nv]` of a force that counts as one: the weight [N] for translations, weight × reach [N m] for rotations, with
     gravity [m/s²] (one number or `[*batch]`) taken as at least 1, so that weightless scenes have a scale too."""
-    strength = torch.as_tensor(gravity, dtype=articulation.dtype, device=articulation.device).clamp_min(1.0)
-    weight = articulation.mass.sum(-1, keepdim=True) * strength[..., None]
+    # a number stays one: as a tensor it would have to be copied to the device
+    strength = gravity.clamp_min(1.0)[..., None] if isinstance(gravity, Tensor) else max(gravity, 1.0)
+    weight = articulation.mass.sum(-1, keepdim=True) * strength
     return (weight * lever(articulation)).detach()
 
 

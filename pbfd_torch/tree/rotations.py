@@ -19,15 +19,15 @@ def _guarded(square: Tensor) -> tuple[Tensor, Tensor]:
 
 def skew(v: Tensor) -> Tensor:
     """Cross-product matrix [v]×, `[*, 3] → [*, 3, 3]`: skew(v) @ w = v × w."""
-    x, y, z = v.unbind(-1)
+    (x, y, z), (minus_x, minus_y, minus_z) = v.unbind(-1), (-v).unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    return torch.stack((zero, minus_z, y, z, zero, minus_x, minus_y, x, zero), -1).unflatten(-1, (3, 3))
 
 
 def unskew(m: Tensor) -> Tensor:
     """Twice the axial vector of a matrix's antisymmetric part, `[*, 3, 3] → [*, 3]`: unskew(skew(v)) = 2 v."""
-    flat = m.flatten(-2)
-    return flat[..., [7, 2, 3]] - flat[..., [5, 6, 1]]
+    twice = m - m.mT
+    return torch.stack((twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]), -1)
 
 
 def sinc(square: Tensor) -> Tensor:

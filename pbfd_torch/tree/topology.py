@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,8 @@ from pbfd_torch.tensors.structures import Constant
 
 @dataclass(frozen=True, eq=False)
 class Topology(Constant):
-    """Nodes are joints, node 0 is the world, node j + 1 is joint j; parents come first. All index tensors are on `device`."""
+    """Nodes are joints, node 0 is the world, node j + 1 is joint j; parents come first. All index tensors are on `device`, and are
+    put there at once: a step must not wait for a copy."""
 
     link_names: tuple[str, ...]
     link_parent: tuple[int, ...]  # −1: the world
@@ -26,11 +28,19 @@ class Topology(Constant):
     joint_parent: tuple[int, ...]  # a node
     device: torch.device
 
+    def __post_init__(self) -> None:
+        for name, value in vars(Topology).items():
+            if isinstance(value, cached_property):
+                getattr(self, name)
+
     def to(self, device: torch.device) -> Topology:
         return self if device == self.device else dataclasses.replace(self, device=device)
 
-    def _long(self, values: list[int]) -> Tensor:
+    def _long(self, values: Sequence[int]) -> Tensor:
         return torch.tensor(values, dtype=torch.long, device=self.device)
+
+    def _mask(self, values: Sequence[bool] | Sequence[Sequence[bool]]) -> Tensor:
+        return torch.tensor(values, dtype=torch.bool, device=self.device)
 
     @property
     def nlink(self) -> int:
@@ -73,15 +83,23 @@ class Topology(Constant):
 
     @cached_property
     def scalar_is_hinge(self) -> Tensor:
-        return torch.tensor([self.joint_is_hinge[j] for j in self._scalars], dtype=torch.bool, device=self.device)
+        return self._mask([self.joint_is_hinge[j] for j in self._scalars])
+
+    @cached_property
+    def _scalar_q(self) -> list[int]:
+        return [self.q_start[j] for j in self._scalars]
 
     @cached_property
     def scalar_q(self) -> Tensor:
-        return self._long([self.q_start[j] for j in self._scalars])
+        return self._long(self._scalar_q)
+
+    @cached_property
+    def _scalar_v(self) -> list[int]:
+        return [self.v_start[j] for j in self._scalars]
 
     @cached_property
     def scalar_v(self) -> Tensor:
-        return self._long([self.v_start[j] for j in self._scalars])
+        return self._long(self._scalar_v)
 
     # ball joints and the rotation of free joints ----------------------------------------------------------------------
     @cached_property
@@ -93,16 +111,24 @@ class Topology(Constant):
         return self._long(self._turning)
 
     @cached_property
+    def _turning_q(self) -> list[int]:
+        ends = [self.q_start[j] + self.joint_sizes[j][0] for j in self._turning]
+        return [i for end in ends for i in range(end - 4, end)]
+
+    @cached_property
     def turning_q(self) -> Tensor:
         """Coordinates of the quaternions, `[nturning, 4]`."""
-        ends = [self.q_start[j] + self.joint_sizes[j][0] for j in self._turning]
-        return self._long([i for end in ends for i in range(end - 4, end)]).view(-1, 4)
+        return self._long(self._turning_q).view(-1, 4)
+
+    @cached_property
+    def _turning_v(self) -> list[int]:
+        ends = [self.v_start[j] + self.joint_sizes[j][1] for j in self._turning]
+        return [i for end in ends for i in range(end - 3, end)]
 
     @cached_property
     def turning_v(self) -> Tensor:
         """Degrees of freedom of the rotations, `[nturning, 3]`."""
-        ends = [self.v_start[j] + self.joint_sizes[j][1] for j in self._turning]
-        return self._long([i for end in ends for i in range(end - 3, end)]).view(-1, 3)
+        return self._long(self._turning_v).view(-1, 3)
 
     def normalized(self, q: Tensor) -> Tensor:
         """A copy of q `[*batch, nq]` with its quaternions at unit norm."""
@@ -122,14 +148,22 @@ class Topology(Constant):
         return self._long([k for k, j in enumerate(self._turning) if self.joint_sizes[j][1] == 6])
 
     @cached_property
+    def _free_q(self) -> list[int]:
+        return [self.q_start[j] + k for j in self._free for k in range(3)]
+
+    @cached_property
     def free_q(self) -> Tensor:
         """Coordinates of the free joints' positions, `[nfree, 3]`."""
-        return self._long([self.q_start[j] + k for j in self._free for k in range(3)]).view(-1, 3)
+        return self._long(self._free_q).view(-1, 3)
+
+    @cached_property
+    def _free_v(self) -> list[int]:
+        return [self.v_start[j] + k for j in self._free for k in range(3)]
 
     @cached_property
     def free_v(self) -> Tensor:
         """Degrees of freedom of the free joints' translations, `[nfree, 3]`."""
-        return self._long([self.v_start[j] + k for j in self._free for k in range(3)]).view(-1, 3)
+        return self._long(self._free_v).view(-1, 3)
 
     # nodes ------------------------------------------------------------------------------------------------------------
     @cached_property
@@ -141,13 +175,13 @@ class Topology(Constant):
     @cached_property
     def v_order(self) -> Tensor:
         """Where to find each degree of freedom in the list «scalar_v, free_v, turning_v»."""
-        order = torch.cat((self.scalar_v, self.free_v.flatten(), self.turning_v.flatten())).tolist()
+        order = self._scalar_v + self._free_v + self._turning_v
         return self._long([order.index(i) for i in range(self.nv)])
 
     @cached_property
     def q_order(self) -> Tensor:
         """Where to find each coordinate in the list «scalar_q, free_q, turning_q»."""
-        order = torch.cat((self.scalar_q, self.free_q.flatten(), self.turning_q.flatten())).tolist()
+        order = self._scalar_q + self._free_q + self._turning_q
         return self._long([order.index(i) for i in range(self.nq)])
 
     @cached_property
@@ -171,7 +205,7 @@ class Topology(Constant):
 
     @cached_property
     def link_node_index(self) -> Tensor:
-        return self._long(list(self.link_node))
+        return self._long(self.link_node)
 
     # degrees of freedom -----------------------------------------------------------------------------------------------
     @cached_property
@@ -180,7 +214,7 @@ class Topology(Constant):
 
     @cached_property
     def dof_joint(self) -> Tensor:
-        return self._long(list(self.dof_joints))
+        return self._long(self.dof_joints)
 
     @cached_property
     def translating(self) -> tuple[bool, ...]:
@@ -195,27 +229,22 @@ class Topology(Constant):
     @cached_property
     def turns(self) -> Tensor:
         """`[nv]` mask of the degrees of freedom that rotate (radians); the others translate (metres)."""
-        turning = set(self.turning_v.flatten().tolist())
-        values = [i in turning or self.joint_is_hinge[j] for i, j in enumerate(self.dof_joints)]
-        return torch.tensor(values, dtype=torch.bool, device=self.device)
+        return self._mask([i in self._turning_v or self.joint_is_hinge[j] for i, j in enumerate(self.dof_joints)])
 
     @cached_property
     def moves_link(self) -> Tensor:
         """`[nlink, nv]` 1 where the degree of freedom moves the link."""
-        rows = [[self._ancestor[j + 1][node] for j in self.dof_joints] for node in self.link_node]
-        return torch.tensor(rows, dtype=torch.bool, device=self.device)
+        return self._mask([[self._ancestor[j + 1][node] for j in self.dof_joints] for node in self.link_node])
 
     @cached_property
     def subtree(self) -> Tensor:
         """`[njoint, nlink]` 1 where the link is moved by the joint."""
-        rows = [[self._ancestor[j + 1][node] for node in self.link_node] for j in range(self.njoint)]
-        return torch.tensor(rows, dtype=torch.bool, device=self.device)
+        return self._mask([[self._ancestor[j + 1][node] for node in self.link_node] for j in range(self.njoint)])
 
     @cached_property
     def above(self) -> Tensor:
         """`[nv, nv]` 1 where i belongs to a joint strictly above j's joint."""
-        rows = [[i != j and self._ancestor[i + 1][j + 1] for j in self.dof_joints] for i in self.dof_joints]
-        return torch.tensor(rows, dtype=torch.bool, device=self.device)
+        return self._mask([[i != j and self._ancestor[i + 1][j + 1] for j in self.dof_joints] for i in self.dof_joints])
 
     @cached_property
     def same_joint(self) -> Tensor:
@@ -225,14 +254,13 @@ class Topology(Constant):
     @cached_property
     def carries(self) -> Tensor:
         """`[nv, nv]` 1 where i moves the axis of j: a joint above, or a free joint's translation below its rotation."""
-        translating = torch.tensor(self.translating, dtype=torch.bool, device=self.device)
+        translating = self._mask(self.translating)
         return self.above | (self.same_joint & translating[:, None] & ~translating[None, :])
 
     @cached_property
     def moves_axis(self) -> Tensor:
         """`[nv, nv]` 1 where i moves the frame in which the twist of j is constant: all that `carries` it, and its own joint."""
-        translating = torch.tensor(self.translating, dtype=torch.bool, device=self.device)
-        return self.above | (self.same_joint & ~translating[None, :])
+        return self.above | (self.same_joint & ~self._mask(self.translating)[None, :])
 
     @cached_property
     def curvature_weight(self) -> Tensor:
