@@ -3,7 +3,7 @@
 In the host's memory LAPACK factors LU. On CUDA cuBLAS does, up to 16 unknowns, for all worlds at once; of more unknowns PyTorch
 (2.13) leaves more than 16 matrices to MAGMA, which waits for its queue and cannot be recorded as a graph. QR by Householder's
 reflections goes to cuBLAS whatever the size, up to 256 rows: it costs twice the operations of an LU, needs no pivots, and is
-backward stable. An LU of our own would launch some 8 kernels for every column.
+backward stable; Cholesky's factorisation goes to cuSOLVER. An LU of our own would launch some 8 kernels for every column.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ LARGEST_LU = 16  # unknowns, on a device
 
 def solved(matrix: Tensor, columns: Tensor) -> Tensor:
     """A⁻¹B `[*batch, n, k]` of matrices A `[*batch, n, n]` and columns B `[*batch, n, k]`. Never raises: where A is singular or
-    not finite the result means nothing."""
+    not finite the result means nothing. Without derivatives."""
     return torch.linalg.solve_ex(matrix, columns)[0] if _by_lu(matrix) else Reflected.of(matrix, columns).solution
 
 
@@ -32,6 +32,15 @@ def solved_with_sign(matrix: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
     swapped = pivots != torch.arange(1, pivots.shape[-1] + 1, dtype=pivots.dtype, device=pivots.device)
     sign = factor.diagonal(dim1=-2, dim2=-1).sign().prod(-1) * (1 - 2 * (swapped.sum(-1) % 2))
     return torch.linalg.lu_solve(factor, pivots, columns), sign
+
+
+def solved_positive(matrix: Tensor, columns: Tensor) -> Tensor:
+    """The same as `solved` for matrices that are symmetric and positive definite, with derivatives on every device."""
+    if _by_lu(matrix):
+        return torch.linalg.solve_ex(matrix, columns)[0]
+    lower, _ = torch.linalg.cholesky_ex(matrix)
+    half = torch.linalg.solve_triangular(lower, columns, upper=False)
+    return torch.linalg.solve_triangular(lower.mT, half, upper=True)
 
 
 def least_squares(matrix: Tensor, columns: Tensor) -> Tensor:

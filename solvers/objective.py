@@ -154,8 +154,3 @@ class Solution:
         """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start. Whoever
         asks first makes the host wait for a device; it is known after that."""
         return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
-
-
-def unsolved_worlds(solution: Solution) -> Tensor:
-    """`solution.unsolved`."""
-    return solution.unsolved

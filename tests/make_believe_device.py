@@ -95,8 +95,16 @@ CHECKS = {"_linalg_check_errors": "check of errors", "_linalg_eigh": "eigh", "_l
 # with a wait for its queue, and cannot be recorded as a graph.
 LU = ("linalg_lu_factor_ex", "_linalg_solve_ex", "linalg_inv_ex", "_linalg_det", "_linalg_slogdet")
 LARGEST_LU = 16
-# Done for all worlds at once by cuBLAS or our own kernels, errors unseen. QR: as long as no factor Q is asked for, up to 256 rows.
-HARMLESS = ("geqrf", "linalg_qr", "linalg_solve_triangular", "linalg_lu_solve", "linalg_vector_norm", "linalg_cross")
+# Done for all worlds at once by cuBLAS, cuSOLVER or PyTorch, errors unseen. QR: where no factor Q is asked for, up to 256 rows.
+HARMLESS = (
+    "geqrf",
+    "linalg_qr",
+    "linalg_cholesky_ex",
+    "linalg_solve_triangular",
+    "linalg_lu_solve",
+    "linalg_vector_norm",
+    "linalg_cross",
+)
 
 # Nobody has looked these up yet, nor the rest of `linalg`: none of them is used in a step.
 LINEAR_ALGEBRA = ("ormqr", "orgqr", "cholesky_solve", "cholesky_inverse", "lu_unpack")
@@ -113,6 +121,7 @@ SEVERAL = {
     "_linalg_det": 6,
     "_linalg_slogdet": 8,
     "geqrf": 5,
+    "linalg_cholesky_ex": 4,
     "linalg_solve_triangular": 5,
     "sort": 2,
 }
@@ -323,9 +332,9 @@ def _waits(name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str | None
     """What an operation of tensors of the device makes the host wait for; None: nothing."""
     if name in READS or name in CHECKS:
         return READS.get(name) or CHECKS[name]
+    if kwargs.get("check_errors"):
+        return f"{name} with its check of errors"
     if name in LU:
-        if kwargs.get("check_errors") or (name == "linalg_inv_ex" and True in args[1:]):
-            return f"{name} with its check of errors"
         return f"{name} of more than {LARGEST_LU} unknowns" if args[0].shape[-1] > LARGEST_LU else None
     if name == "linalg_qr" and "r" not in args:
         return "qr, whose factor Q is made world by world,"

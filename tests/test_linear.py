@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch.solvers.linear import LARGEST_LU, least_squares, solved, solved_with_sign
+from pbfd_torch.solvers.linear import LARGEST_LU, least_squares, solved, solved_positive, solved_with_sign
 from tests.make_believe_device import DEVICE, make_believe, values
 from tests.random_trees import generator
 
@@ -89,6 +89,39 @@ def test_bad_worlds_spoil_no_other(n: int) -> None:
     assert sign[1:4].tolist() == [0.0, 0.0, 0.0]
     assert not bool(torch.isfinite(solution[1:4]).flatten(1).all(1).any())
     assert torch.equal(solution[[0, 4]], whole[[0, 4]])
+
+
+@both_dtypes
+@pytest.mark.parametrize("n", SIZES)
+def test_positive_matrices(n: int, dtype: torch.dtype) -> None:
+    """A X = B to rounding on both devices; on the host bitwise as by LAPACK's LU."""
+    matrix, columns = system(n, dtype)
+    positive = matrix @ matrix.mT + torch.eye(n, dtype=dtype)
+    here = solved_positive(positive, columns)
+    assert torch.equal(here, torch.linalg.solve_ex(positive, columns)[0])
+    with make_believe():
+        there = positive.to(DEVICE), columns.to(DEVICE)
+        with make_believe() as tally:
+            solution = values(solved_positive(*there))
+    assert (tally.waits, tally.copies) == (Counter(), Counter())
+    assert max(leftover(positive, x, columns) for x in (here, solution)) <= 2 * n
+
+
+def test_derivatives_of_a_solution() -> None:
+    """By the size of a positive matrix, through what a device does: those of the host."""
+    matrix, columns = system(24, torch.float64, (2,))
+    positive = matrix @ matrix.mT + torch.eye(24, dtype=torch.float64)
+
+    def of(matrix: Tensor, size: Tensor, columns: Tensor) -> Tensor:
+        return solved_positive((1 + size) * matrix, columns).square().sum()
+
+    size = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    expected = torch.autograd.grad(of(positive, size, columns), size)[0]
+    with make_believe():
+        x, b = positive.to(DEVICE), columns.to(DEVICE)
+        there = torch.zeros((), dtype=torch.float64, device=DEVICE, requires_grad=True)
+        found = torch.autograd.grad(of(x, there, b), there)[0]
+    torch.testing.assert_close(values(found), expected, rtol=1e-9, atol=0)
 
 
 @both_dtypes

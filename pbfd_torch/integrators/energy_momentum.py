@@ -34,6 +34,7 @@ from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fall, fresh
+from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_springs import Armature
@@ -258,5 +259,5 @@ def _ended(
 
 def _solved(inertia: Tensor, *momenta: Tensor) -> tuple[Tensor, ...]:
     """The velocities M⁻¹ of momenta, each `[*batch, nv]`."""
-    columns, _ = torch.linalg.solve_ex(inertia, torch.stack(momenta, -1))
+    columns = solved_positive(inertia, torch.stack(momenta, -1))
     return tuple(x.contiguous() for x in columns.unbind(-1))

@@ -72,7 +72,7 @@ def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Seq
     if not able:
         return terms
     inertia = mass_matrix(articulation, articulation.rest, terms)
-    felt = 1 / torch.linalg.inv(inertia).diagonal(dim1=-2, dim2=-1)
+    felt = 1 / torch.linalg.inv_ex(inertia).inverse.diagonal(dim1=-2, dim2=-1)
     slope = sum((term.slope(articulation, dt) for term in able), torch.zeros_like(felt))
     share = fit((dt * dt)[..., None] * slope / felt)
     turning = torch.zeros_like(articulation.topology.turns).index_fill(0, articulation.topology.turning_v.flatten(), True)

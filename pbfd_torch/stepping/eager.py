@@ -19,6 +19,7 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
+from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Detour, Way
@@ -130,7 +131,7 @@ class EagerStepper(Generic[S]):
         objective = stepper.objective(start, control)
         abrupt, others = objective.forces(end.q)
         others = others - bias_force(a, q, v, self.scene.gravity)
-        columns, _ = torch.linalg.solve_ex(mass_matrix(a, q, self.scene.terms), torch.stack((abrupt, others), -1))
+        columns = solved_positive(mass_matrix(a, q, self.scene.terms), torch.stack((abrupt, others), -1))
         by_abrupt, by_others = columns.unbind(-1)
         # an impact within the step has given nothing before it
         steady = calm(objective, objective.step.previous, self.step_size[..., None] * by_abrupt)
