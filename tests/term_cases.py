@@ -12,13 +12,14 @@ from torch import Tensor
 
 from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Curved, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
@@ -117,7 +118,8 @@ def contact(
 ) -> Contact:
     """Contact with a tilted plane that about half of the candidates have pierced, none being closer to it than necessary."""
     colliders = colliders_of(s.articulation, shapes, margin)
-    made = Contact.between(s.articulation, colliders, HalfSpace(normal=NORMAL), NormalForce(1e4, exponent, release), friction)
+    kind = CurvedContact if isinstance(shapes[0], Curved) else Contact
+    made = kind.between(s.articulation, colliders, HalfSpace(normal=NORMAL), NormalForce(1e4, exponent, release), friction)
     depth = made.depth(place(s.articulation, s.q))
     ordered = depth.sort(-1).values
     quarter = depth.shape[-1] // 4
@@ -184,6 +186,7 @@ class TermCase:
 
 
 ROUND = (Sphere(0.1), Capsule(0.05, 0.2))
+CURVED = (Cylinder(0.1, 0.05), Ellipsoid((0.1, 0.2, 0.05)))
 STICKING = CoulombFriction(0.7, slip_speed=50.0)  # one metre of slip over a step of .02 s: all slips are far below
 SLIDING = CoulombFriction(0.7, slip_speed=1e-4)  # two micrometres: all slips are far above
 WEAKENING = StaticFriction(0.7, 0.4, slip_speed=1e-4, stribeck_speed=10.0)  # falls over some decimetres
@@ -205,6 +208,11 @@ CONTACTS = (
     TermCase("Coulomb, sticking, rolling", lambda s: contact(s, STICKING, shapes=ROUND)),
     TermCase("Coulomb, sliding, rolling", lambda s: contact(s, SLIDING, shapes=ROUND)),
     TermCase("Coulomb, sliding, all shapes", lambda s: contact(s, SLIDING, shapes=(*ROUND, Point(), Box((0.1, 0.2, 0.05))))),
+    TermCase("contact, curved", lambda s: contact(s, None, shapes=CURVED), "energy"),
+    TermCase("contact, curved, margin, letting go", lambda s: contact(s, None, 3.0, CURVED, 0.03, QUICK), "energy"),
+    TermCase("Coulomb, sticking, curved", lambda s: contact(s, STICKING, shapes=CURVED)),
+    TermCase("Coulomb, sliding, curved", lambda s: contact(s, SLIDING, shapes=CURVED)),
+    TermCase("PBFD as printed, curved", lambda s: contact(s, PbfdFriction.as_printed(5e4), shapes=CURVED)),
     TermCase("PBFD as printed", lambda s: contact(s, PbfdFriction.as_printed(5e4))),
     TermCase("PBFD as derived", lambda s: contact(s, PbfdFriction.as_derived(5e4))),
     TermCase("PBFD as printed, β = .5, γ = 1.5", lambda s: contact(s, PbfdFriction.as_printed(5e4, 0.5, 1.5))),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pbfd_torch import Articulation, InputError, Joint, JointKind, Link, ModelError, Scene, Simulator
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Ellipsoid, Sphere
 from pbfd_torch.models.chains import chain_ground
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
@@ -201,7 +201,6 @@ BAD_PARAMETERS: dict[str, tuple[Callable[[], object], str]] = {
     "sphere radius 0": (lambda: Sphere(0.0), "sphere radius is 0.0"),
     "capsule half length < 0": (lambda: Capsule(0.1, -1.0), "capsule radius, half length"),
     "box extent NaN": (lambda: Box((0.1, math.nan, 0.1)), "box half extents"),
-    "cylinder rim": (lambda: Cylinder(0.1, 0.1, rim_points=2), "rim_points is 2: must be ≥ 3"),
     "ellipsoid axis 0": (lambda: Ellipsoid((0.1, 0.0, 0.1)), "ellipsoid semi-axes"),
     "flat hull": (lambda: ConvexHull(np.zeros((3, 3))), "hull vertices"),
     "collider margin < 0": (lambda: Collider("c", "body", Sphere(0.1), margin=-0.1), "margin of collider 'c'"),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.obstacle import Obstacle
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Shape, Sphere
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -34,6 +34,9 @@ SHAPES: dict[str, tuple[Shape, Shape]] = {
     "boxes": (Box((0.2, 0.3, 0.15)), Box((0.25, 0.2, 0.2))),
     "capsule, box": (Capsule(0.15, 0.3), Box((0.25, 0.2, 0.2))),
     "cylinder, box": (Cylinder(0.2, 0.2), Box((0.25, 0.2, 0.2))),
+    "box, ellipsoid": (Box((0.25, 0.2, 0.2)), Ellipsoid((0.2, 0.25, 0.15))),
+    "cylinder, capsule": (Cylinder(0.2, 0.2), Capsule(0.15, 0.3)),
+    "cylinder, ellipsoid": (Cylinder(0.2, 0.2), Ellipsoid((0.2, 0.25, 0.15))),
 }
 
 

@@ -155,7 +155,7 @@ def two_free() -> Articulation:
     return Articulation.from_links([link("a", "", JointKind.FREE), link("b", "", JointKind.FREE)])
 
 
-ROUND, POLYTOPES, BALL_BOX = ["RoundPairs"], ["PolytopePairs"], ["BallBoxPairs"]
+ROUND, POLYTOPES, BALL_BOX, CURVED = ["RoundPairs"], ["PolytopePairs"], ["BallBoxPairs"], ["CurvedPairs"]
 BETWEEN: list[tuple[Shape, Shape, list[str]]] = [
     (BALL, BALL, ROUND),
     (BALL, Capsule(0.1, 0.2), ROUND),
@@ -165,7 +165,7 @@ BETWEEN: list[tuple[Shape, Shape, list[str]]] = [
     (Box((0.1, 0.1, 0.1)), Box((0.1, 0.1, 0.1)), POLYTOPES),
     (Capsule(0.1, 0.2), Box((0.1, 0.1, 0.1)), POLYTOPES),
     (HULL, BALL, POLYTOPES),
-    (Cylinder(0.1, 0.2), Ellipsoid((0.1, 0.2, 0.3)), POLYTOPES),
+    (Cylinder(0.1, 0.2), Ellipsoid((0.1, 0.2, 0.3)), CURVED),
     (Point(), BALL, []),
     (Point(), Point(), []),
 ]
@@ -187,7 +187,7 @@ AGAINST: list[tuple[Shape, HalfSpace | Obstacle, str]] = [
     (Capsule(0.1, 0.2), Obstacle("o", BALL), "RoundPairs"),
     (Box((0.1, 0.1, 0.1)), Obstacle("o", BALL), "BallBoxPairs"),
     (Capsule(0.1, 0.2), Obstacle("o", Box((1, 1, 1))), "PolytopePairs"),
-    (HULL, Obstacle("o", Cylinder(0.1, 0.2)), "PolytopePairs"),
+    (HULL, Obstacle("o", Cylinder(0.1, 0.2)), "CurvedPairs"),
 ]
 
 

@@ -31,9 +31,9 @@ SOLIDS: tuple[Shape, ...] = (
     Capsule(0.1, 0.3),
     Sphere(0.2),
     Point(),
-    Cylinder(0.3, 0.2, 12),
+    ConvexHull(Cylinder(0.3, 0.2).candidates()[0]),
     ConvexHull(0.3 * RANDOM.normal(size=(20, 3))),
-    Ellipsoid((0.3, 0.2, 0.4), 20),
+    ConvexHull(Ellipsoid((0.3, 0.2, 0.4)).candidates()[0]),
     ConvexHull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0.7, 0.7, 0]])),  # flat
 )
 REQUEST = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=True)
@@ -338,7 +338,9 @@ def test_swapped_bodies_mirror(name: str) -> None:
 @pytest.mark.parametrize("most", [1, 3, 4, 8])
 def test_reduction(most: int) -> None:
     """Prisms of 24 corners on one another: `most` points, spread out over the rim, all of them corners."""
-    prism = Cylinder(0.5, 0.2, 24)
+    angle = np.pi / 12 * np.arange(24)
+    ring = np.stack((0.5 * np.cos(angle), 0.5 * np.sin(angle), np.full(24, 0.2)), -1)
+    prism = ConvexHull(np.concatenate((ring, ring * (1, 1, -1))))
     found = pair(prism, prism, pose((0, 0, 0.4)), most=most)
     points = found.row()
     assert len(points) == most

@@ -67,8 +67,11 @@ def manifold(
         raise InputError(f"most is {most}: must be ≥ 1 point per pair")
     aligned_a, face_a = _aligned(table, a, pose_a, -normal)
     aligned_b, face_b = _aligned(table, b, pose_b, normal)
-    swapped = aligned_a > aligned_b + _ALIGNED
     by_face = torch.maximum(aligned_a, aligned_b) > 1 - _ALIGNED
+    # a curved body gives the points wherever it can: they move over it
+    flat_a, flat_b = (aligned - 2 * _ALIGNED * table.curved[x] for aligned, x in ((aligned_a, a), (aligned_b, b)))
+    swapped = torch.where(by_face, flat_a > flat_b + _ALIGNED, aligned_a > aligned_b + _ALIGNED)
+    swapped = torch.where(~by_face & (table.curved[a] != table.curved[b]), table.curved[b], swapped)
     reference, incident = torch.where(swapped, a, b), torch.where(swapped, b, a)
     swap = swapped[:, None, None]
     top_a, top_b = pose_a[:, :3], pose_b[:, :3]
@@ -80,6 +83,9 @@ def manifold(
     vertices = rotated(rotation[:, None], table.vertices[incident]) + translation[:, None]
     toward = rotated(base[:, :3, :3].mT, torch.where(swapped[:, None], -normal, normal))
     support = dot(table.vertices[reference], toward[:, None]).amax(-1)
+    curved = table.curved[reference]
+    spread = torch.where(curved, dot(table.form[reference], toward.square()), 1.0)
+    support = torch.where(curved, table.half[reference] * toward[:, 2].abs() + spread.sqrt(), support)
     n = torch.where(by_face[:, None], table.normals[reference, face], toward)
     offset = torch.where(by_face, table.offsets[reference, face], support)
 
@@ -112,7 +118,7 @@ def _aligned(table: PolytopeTable, shape: Tensor, pose: Tensor, outward: Tensor)
     """Largest cosine `[K]` between a face's normal and a direction in the world `[K, 3]`, and which face; −1 where there are
     none."""
     local = rotated(pose[:, :3, :3].mT, outward)
-    cosine = torch.where(table.is_face[shape], dot(table.normals[shape], local[:, None]), -1.0)
+    cosine = torch.where(table.is_flat[shape], dot(table.normals[shape], local[:, None]), -1.0)
     return cosine.max(-1)
 
 

@@ -16,11 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.contact.shapes import Points, Shape
+from pbfd_torch.contact.shapes import Curved, Points, Rim, Shape
 from pbfd_torch.errors import InputError
 
 Indices = NDArray[np.int64]
 
+_CAP = 1 - 1e-9  # of the normal of a cylinder's cap, along its axis
 _FLAT = 1e-9  # of the size: extents and distances to a plane below it count as zero
 
 
@@ -35,6 +36,8 @@ class Polytope:
             Without faces one row: the segment or the point.
         edges: `[E, 2]` vertices of each edge; the point is an edge of length zero.
         radius: ρ ≥ 0 [m].
+        flat: `[F]` which faces are the shape's own, not of the polytope that stands for a curved one.
+        rim: of a curved shape.
     """
 
     vertices: Points
@@ -42,6 +45,8 @@ class Polytope:
     polygons: Indices
     edges: Indices
     radius: float
+    flat: NDArray[np.bool_]
+    rim: Rim | None = None
 
     @property
     def thickness(self) -> float:
@@ -66,7 +71,10 @@ def polytope_of(shape: Shape) -> Polytope:
     proper = pairs[pairs[:, 0] < pairs[:, 1]]
     edges = np.unique(proper if len(proper) else pairs, axis=0)
     planes = np.array([_plane(vertices[face]) for face in faces]).reshape(-1, 4)
-    return Polytope(vertices, planes, polygons, edges, radius)
+    if not isinstance(shape, Curved):
+        return Polytope(vertices, planes, polygons, edges, radius, np.ones(len(planes), dtype=np.bool_))
+    caps = np.abs(planes[:, 2]) > _CAP if shape.rim.half > 0 else np.zeros(len(planes), dtype=np.bool_)
+    return Polytope(vertices, planes, polygons, edges, radius, caps, shape.rim)
 
 
 def thickness_of(shape: Shape) -> float:
@@ -120,17 +128,22 @@ class PolytopeTable:
     polygon's first corner and a shape's last edge, which changes no extreme; padded faces have normal zero.
 
     Attributes: `vertices` `[S, V, 3]`, `normals` `[S, F, 3]`, `offsets` `[S, F]`, `polygons` `[S, F, M]`, `edges` `[S, E, 2]`,
-    `radius` `[S]` as in `Polytope`; `is_face` `[S, F]`: False for padding and for the one polygon of a segment or a point; `size`
-    `[S]` [m]: half the diagonal of the box around the core, plus the radius."""
+    `radius` `[S]` as in `Polytope`; `is_face` `[S, F]`: False for padding and for the one polygon of a segment or a point;
+    `is_flat` `[S, F]`: of these the shape's own, see `Polytope.flat`; `curved` `[S]`; `form` `[S, 3]`, `half` `[S]`: see `Rim`,
+    zero for others; `size` `[S]` [m]: half the diagonal of the box around the core, plus the radius."""
 
     vertices: Tensor
     normals: Tensor
     offsets: Tensor
     is_face: Tensor
+    is_flat: Tensor
     polygons: Tensor
     edges: Tensor
     radius: Tensor
     size: Tensor
+    curved: Tensor
+    form: Tensor
+    half: Tensor
 
     @staticmethod
     def stack(polytopes: Sequence[Polytope]) -> PolytopeTable:
@@ -151,12 +164,16 @@ class PolytopeTable:
             normals=planes[..., :3],
             offsets=planes[..., 3],
             is_face=tensor([np.arange(faces) < len(p.planes) for p in polytopes]),
+            is_flat=tensor([np.pad(p.flat, (0, faces - len(p.flat))) for p in polytopes]),
             polygons=tensor([np.pad(ring, ((0, faces - len(ring)), (0, 0))) for ring in rings]),
             edges=tensor([np.pad(p.edges, ((0, edges - len(p.edges)), (0, 0)), mode="edge") for p in polytopes]),
             radius=torch.tensor([p.radius for p in polytopes], dtype=torch.float64),
             size=torch.tensor(
                 [0.5 * np.linalg.norm(np.ptp(p.vertices, axis=0)) + p.radius for p in polytopes], dtype=torch.float64
             ),
+            curved=torch.tensor([p.rim is not None for p in polytopes]),
+            form=torch.tensor([p.rim.form if p.rim else (0.0, 0.0, 0.0) for p in polytopes], dtype=torch.float64),
+            half=torch.tensor([p.rim.half if p.rim else 0.0 for p in polytopes], dtype=torch.float64),
         )
 
     def to(self, dtype: torch.dtype, device: torch.device | str | None = None) -> Self:

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -50,21 +50,22 @@ class PolytopePairs(Finder):
     boxes: Tensor
     broad_phase: BroadPhase
 
-    @staticmethod
+    @classmethod
     def of(
+        cls,
         pairs: Sequence[tuple[int, int, int]],
         bodies: Sequence[int],
         frames: Tensor,
         polytopes: Sequence[Polytope],
         are_boxes: Sequence[bool],
         slots: int,
-    ) -> PolytopePairs:
+    ) -> Self:
         """From pairs (number, collider, collider); of each collider its body, its frame in it `[c, 4, 4]`, its shape, and whether
         that is a box."""
         device = frames.device
         first, second = indices([a for _, a, _ in pairs], device), indices([b for _, _, b in pairs], device)
         boxes = [are_boxes[a] and are_boxes[b] for _, a, b in pairs]
-        return PolytopePairs(
+        return cls(
             pair=indices([k for k, _, _ in pairs], device),
             first=first,
             second=second,
@@ -160,17 +161,17 @@ class PolytopePairs(Finder):
             return self._empty(batch)
         # rows of one world stand together: their places among them lead to a padded table [worlds, most, POINTS]
         count = (world == torch.arange(worlds, device=row.device)[:, None]).sum(-1)
-        most = int(count.max())
+        most, points_of_pair = int(count.max()), gap.shape[-1]
         order = torch.arange(len(row), device=row.device) - (count.cumsum(0) - count)[world]
         index = torch.zeros((worlds, most), dtype=torch.long, device=row.device)
         index[world, order] = torch.arange(len(row), device=row.device)
         there = torch.arange(most, device=row.device) < count[:, None]
         picked = index.reshape(-1)
         gaps = gap[picked].reshape(worlds, -1)
-        real = (within[picked].reshape(worlds, most, POINTS) & there[..., None]).reshape(worlds, -1)
+        real = (within[picked].reshape(worlds, most, points_of_pair) & there[..., None]).reshape(worlds, -1)
         which, filled, dropped = nearest(gaps, real, self.slots)
-        rows = index.gather(-1, which // POINTS)
-        spot = which % POINTS
+        rows = index.gather(-1, which // points_of_pair)
+        spot = which % points_of_pair
 
         def shaped(values: Tensor) -> Tensor:
             return values.reshape((*batch, *values.shape[1:]))
@@ -179,7 +180,7 @@ class PolytopePairs(Finder):
         position = rotated(frame_of_points[..., :3, :3], found.point[rows, spot]) + frame_of_points[..., :3, 3]
         normal = rotated(frame_of_plane[..., :3, :3], found.normal[rows])
         offset = found.offset[rows] + dot(normal, frame_of_plane[..., :3, 3])
-        return Slots(
+        slots = Slots(
             filled=shaped(filled),
             pair=shaped(self.pair[row[rows]]),
             first=shaped(self.body[points[rows]]),
@@ -189,6 +190,11 @@ class PolytopePairs(Finder):
             surface=Plane(shaped(normal), shaped(offset)),
             dropped=shaped(dropped),
         )
+        return self._of_points(slots, shaped(points[rows]), shaped(spot))
+
+    def _of_points(self, slots: Slots, shape: Tensor, spot: Tensor) -> Slots:
+        """The slots with what else there is to say about their points."""
+        return slots
 
     def _empty(self, batch: tuple[int, ...]) -> Slots:
         zero = self.frame.new_zeros((*batch, self.slots))
@@ -197,4 +203,5 @@ class PolytopePairs(Finder):
         up = torch.nn.functional.pad(torch.ones_like(zero)[..., None], (2, 0))
         position = zero[..., None].expand(*zero.shape, 3)
         first, second = number + self.body[self.first[:1]], number + self.body[self.second[:1]]
-        return Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])
+        slots = Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])
+        return self._of_points(slots, number, number)

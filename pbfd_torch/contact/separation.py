@@ -129,7 +129,7 @@ class _Pair:
             ),
             1,
         )
-        faces = torch.where(torch.cat((table.is_face[b], table.is_face[a]), 1), faces, -torch.inf) - radii[:, None]
+        faces = torch.where(torch.cat((table.is_flat[b], table.is_flat[a]), 1), faces, -torch.inf) - radii[:, None]
         (low_a, high_a), (low_b, high_b) = (_extent(others, x) for x in (self.vertices_a, self.vertices_b_own))
         free = torch.cat((low_a - high_b, low_b - high_a), 1) - radii[:, None]
         directions = torch.cat((normals_b, -rotated(self.rotation[:, None], normals_a), others, -others), 1)

@@ -1,7 +1,8 @@
 """Collision shapes of links, and the candidate contact points each gives against a flat obstacle.
 
 A candidate is a centre fixed in the link and a radius: the point of the body that can touch. Spheres and capsules are exact
-against a plane; boxes and convex hulls are exact through their vertices; the rim of a cylinder and an ellipsoid are sampled.
+against a plane; boxes and convex hulls are exact through their vertices. Cylinders and ellipsoids are `Curved`: their candidates
+move over them.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
 
 Points = NDArray[np.float64]
+HOLDING = 8  # points that hold a rim which lies flat
+PRISM = 16  # corners of the prism that stands for a cylinder where bodies are looked for
+LATTICE = 58  # points of the polytope that stands for an ellipsoid, besides its poles
 
 
 @runtime_checkable
@@ -29,6 +33,45 @@ class Shape(Protocol):
 
     def candidates(self) -> tuple[Points, Points]:
         """Centres `[n, 3]` and radii `[n]` of the points that can touch a plane."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Supports:
+    """Ellipsoids whose hull is a curved shape, all in its frame.
+
+    Attributes:
+        centers: `[n, 3]` [m]. forms: `[n, 3, 3]` M [m²], see `terms.supported`.
+        axes: `[n, 3]` of the rims that they belong to.
+        lying: `[n]` 1: points that hold a rim which lies flat; −1: the rim itself; 0: neither.
+    """
+
+    centers: Points
+    forms: Points
+    axes: Points
+    lying: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Rim:
+    """A curved shape as the hull of ellipsoids of one form, centred on its z axis from −`half` to `half` [m]. `form`: M's diagonal
+    [m²]."""
+
+    form: tuple[float, float, float]
+    half: float
+
+
+@runtime_checkable
+class Curved(Protocol):
+    """A shape that rolls, and is no ball."""
+
+    @property
+    def rim(self) -> Rim:
+        """Its ellipsoids."""
+        ...
+
+    def supports(self) -> Supports:
+        """What touches a plane."""
         ...
 
 
@@ -112,22 +155,40 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Along z. `rim_points` on each rim: a cylinder that rolls does so as a prism, its axis dipping by r(1 − cos(π/rim_points))."""
+    """Along z."""
 
     radius: float
     half_length: float
-    rim_points: int = 16
 
     def __post_init__(self) -> None:
         _require_positive("cylinder radius, half length", self.radius, self.half_length)
-        if self.rim_points < 3:
-            raise InputError(f"rim_points is {self.rim_points}: must be ≥ 3")
 
     def candidates(self) -> tuple[Points, Points]:
-        angle = 2 * np.pi * np.arange(self.rim_points) / self.rim_points
+        """Of the prism that stands for it where bodies are looked for."""
+        points = self._around(PRISM)
+        return points, np.zeros(len(points))
+
+    def _around(self, count: int) -> Points:
+        """So many points on each rim."""
+        angle = 2 * np.pi * np.arange(count) / count
         ring = np.stack((self.radius * np.cos(angle), self.radius * np.sin(angle)), -1)
-        ends = [np.concatenate((ring, np.full((self.rim_points, 1), z)), 1) for z in (-self.half_length, self.half_length)]
-        return np.concatenate(ends), np.zeros(2 * self.rim_points)
+        return np.concatenate([np.concatenate((ring, np.full((count, 1), z)), 1) for z in (-self.half_length, self.half_length)])
+
+    @property
+    def rim(self) -> Rim:
+        """Its rims. They are a little thick along the axis, so that their lowest point moves smoothly across the cap as they pass
+        through the level."""
+        thick = 1e-3 * min(self.radius, self.half_length)
+        return Rim((self.radius**2, self.radius**2, thick**2), self.half_length - thick)
+
+    def supports(self) -> Supports:
+        """Both rims, and points on them that hold them where they lie flat."""
+        form = np.diag(self.rim.form)
+        rims = np.array([[0, 0, z] for z in (-self.rim.half, self.rim.half)])
+        centers = np.concatenate((rims, self._around(HOLDING)))
+        forms = np.concatenate((np.stack([form] * 2), np.zeros((2 * HOLDING, 3, 3))))
+        lying = np.array([-1] * 2 + [1] * 2 * HOLDING)
+        return Supports(centers, forms, np.tile([0.0, 0.0, 1.0], (len(centers), 1)), lying)
 
     def surface(self, dtype: torch.dtype, device: torch.device) -> Surface:
         radius, half_length = torch.tensor([[self.radius], [self.half_length]], dtype=dtype, device=device)
@@ -136,21 +197,31 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """Semi-axes along x, y, z; its surface is sampled at `points` directions (Fibonacci lattice) plus the six poles."""
+    """Semi-axes along x, y, z."""
 
     semi_axes: tuple[float, float, float]
-    points: int = 58
 
     def __post_init__(self) -> None:
         _require_positive("ellipsoid semi-axes", *self.semi_axes)
 
     def candidates(self) -> tuple[Points, Points]:
-        k = np.arange(self.points) + 0.5
-        z = 1 - 2 * k / self.points
+        """Of the polytope that stands for it where bodies are looked for: a Fibonacci lattice and the six poles."""
+        k = np.arange(LATTICE) + 0.5
+        z = 1 - 2 * k / LATTICE
         angle = np.pi * (1 + 5**0.5) * k
         ring = np.sqrt(1 - z * z)
         directions = np.concatenate((np.stack((ring * np.cos(angle), ring * np.sin(angle), z), -1), np.eye(3), -np.eye(3)))
         return directions * np.array(self.semi_axes), np.zeros(len(directions))
+
+    @property
+    def rim(self) -> Rim:
+        """Itself."""
+        x, y, z = self.semi_axes
+        return Rim((x * x, y * y, z * z), 0.0)
+
+    def supports(self) -> Supports:
+        """Itself."""
+        return Supports(np.zeros((1, 3)), np.diag(self.rim.form)[None], np.array([[0.0, 0.0, 1.0]]), np.zeros(1, dtype=np.int64))
 
 
 @dataclass(frozen=True, eq=False)

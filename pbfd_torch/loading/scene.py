@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.shapes import Curved
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
@@ -41,6 +44,10 @@ def ground_below(robot: Robot) -> HalfSpace:
     articulation = robot.articulation
     if not robot.colliders:
         return HalfSpace()
-    probe = Contact.between(articulation, robot.colliders, HalfSpace(), NormalForce(1.0), None)
-    depth = probe.depth(place(articulation, articulation.rest))
-    return HalfSpace(offset=-float(depth.max()))
+    at_rest = place(articulation, articulation.rest)
+    deepest = -math.inf
+    for kind, curved in ((Contact, False), (CurvedContact, True)):
+        if some := [x for x in robot.colliders if isinstance(x.shape, Curved) is curved]:
+            probe = kind.between(articulation, some, HalfSpace(), NormalForce(1.0))
+            deepest = max(deepest, float(probe.depth(at_rest).max()))
+    return HalfSpace(offset=-deepest)

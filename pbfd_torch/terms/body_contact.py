@@ -100,15 +100,15 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         with torch.no_grad():  # which candidates there are does not change smoothly; where they are does
             reach = 1.5 * self._travel(bodies, ahead) + self.slack
         slots = self._found(bodies, reach)
-        first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
+        first, second = of_slots(bodies, slots.first), of_slots(bodies, slots.second)
         turned = second[..., :3].mT @ first[..., :3]
         start = in_frames(second, mapped(first, slots.position)) + step.dt[..., None, None] * self._running(slots, turned)
         dt = step.dt[..., None]
         depth, bounce = self._beginning(
             dt,
-            lambda: _gaps(slots, bodies),
-            lambda: _gaps(slots, ahead),
-            lambda: _gaps(slots, torch.cat((step.coasting_poses, obstacles), -3)),
+            lambda: self._gaps(slots, bodies),
+            lambda: self._gaps(slots, ahead),
+            lambda: self._gaps(slots, torch.cat((step.coasting_poses, obstacles), -3)),
         )
         return PreparedBodyContact(
             slots=slots,
@@ -147,6 +147,11 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             slots = finder.find(bodies, reach)
         return slots
 
+    def _gaps(self, slots: Slots, bodies: Tensor) -> Tensor:
+        """How far the points are from the solids [m] `[*batch, n]`."""
+        first, second = of_slots(bodies, slots.first), of_slots(bodies, slots.second)
+        return Placed(slots.surface, second).field(mapped(first, slots.position)).distance - slots.radius
+
     def _travel(self, before: Tensor, after: Tensor) -> Tensor:
         """How far the farthest collider point of each body moves at most [m], `[*batch, nbody]`."""
         shift = torch.linalg.vector_norm((after - before)[..., :3, 3], dim=-1)
@@ -157,7 +162,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
         far = (self._travel(prepared.bodies, prepared.standing(placement)) > prepared.reach).any(-1)
         slots = prepared.slots
-        overlapped = (slots.filled & (_gaps(slots, prepared.bodies) < -self.slack)).any(-1)
+        overlapped = (slots.filled & (self._gaps(slots, prepared.bodies) < -self.slack)).any(-1)
         found = {Hazard.CANDIDATES_DROPPED: slots.dropped, Hazard.MOVED_TOO_FAR: far, Hazard.OVERLAPPED: overlapped}
         return torch.stack([where.to(torch.int32) * int(bit) for bit, where in found.items()]).sum(0, dtype=torch.int32)
 
@@ -166,7 +171,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         slots = prepared.slots
         if not self._anchors:
             return prepared.start.new_zeros((*prepared.start.shape[:-2], 0, 7))
-        at, frame = self.touching(prepared, placement), _of_slots(prepared.standing(placement), slots.second)
+        at, frame = self.touching(prepared, placement), of_slots(prepared.standing(placement), slots.second)
         kept = applied(frame[..., :3].mT, self._anchors.kept(at.slip, at.depth))
         pair = torch.where(slots.filled & (at.depth > 0), slots.pair, -1).to(kept.dtype)
         return torch.cat((kept, slots.position, pair[..., None]), -1)[..., : self.finder.slots, :]
@@ -174,7 +179,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
     def touching(self, prepared: PreparedBodyContact, placement: Placement) -> Touching:
         """See `ContactLaws`."""
         slots, bodies = prepared.slots, prepared.standing(placement)
-        first, frame = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
+        first, frame = of_slots(bodies, slots.first), of_slots(bodies, slots.second)
         centers = mapped(first, slots.position)
         field = Placed(slots.surface, frame).field(centers)
         start = prepared.start if prepared.anchor is None else prepared.start - prepared.anchor
@@ -218,7 +223,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         return LinkLoad(moment, stiffness, coupling, outlook)
 
 
-def _of_slots(bodies: Tensor, index: Tensor) -> Tensor:
+def of_slots(bodies: Tensor, index: Tensor) -> Tensor:
     """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`; either may be that of one world for all."""
     batch = torch.broadcast_shapes(bodies.shape[:-3], index.shape[:-1])
     place = index[..., None, None].expand(*batch, index.shape[-1], 3, 4)
@@ -230,22 +235,16 @@ def _outlook(slots: Slots, obstacles: int, contact: ContactForce, motion: Motion
     at = contact.at
     still = motion.rates.new_zeros((*motion.rates.shape[:-3], obstacles, 3, 4))
 
-    def of_slots(of_links: Tensor, body: Tensor) -> Tensor:
-        return _of_slots(torch.cat((of_links, still), -3), body)
+    def seen(of_links: Tensor, body: Tensor) -> Tensor:
+        return of_slots(torch.cat((of_links, still), -3), body)
 
-    first, second = ([of_slots(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
+    first, second = ([seen(x, body) for x in (motion.velocities, motion.changes)] for body in (slots.first, slots.second))
     velocity = mapped(first[0] - second[0], at.centers)
     carried = 2 * applied(second[0][..., :3], velocity)  # Coriolis: seen from a turning body
     acceleration = mapped(first[1] - second[1], at.centers) - carried
-    out = slots.radius[..., None] * at.normal
+    out = at.centers - at.points
     spin = first[0][..., :3] - second[0][..., :3]
     return contact_outlook(contact, velocity - applied(spin, out), acceleration)
-
-
-def _gaps(slots: Slots, bodies: Tensor) -> Tensor:
-    """How far the points are from the solids [m] `[*batch, n]`."""
-    first, second = _of_slots(bodies, slots.first), _of_slots(bodies, slots.second)
-    return Placed(slots.surface, second).field(mapped(first, slots.position)).distance - slots.radius
 
 
 def _turning(contact: ContactForce) -> tuple[Tensor, Tensor]:

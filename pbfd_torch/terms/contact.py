@@ -176,13 +176,16 @@ class Contact(ContactLaws[PreparedContact]):
         free = functools.cache(lambda: self._centers(step.target_poses))
         if math.isfinite(self.thickness):
             moves = torch.linalg.vector_norm(free() - centers, dim=-1)
-            surface = Tangent.before(surface, _seen(frame, centers), moves, self.thickness)
+            surface = Tangent.before(surface, seen(frame, centers), moves, self.thickness)
 
-        def gap(points: Tensor) -> Tensor:
-            return -self._depth(surface.field(_seen(frame, points)))
+        def gap(points: Tensor, rotations: Tensor) -> Tensor:
+            return -self._depth(surface.field(seen(frame, points)), frame, rotations)
 
         depth, bounce = self._beginning(
-            dt, lambda: gap(centers), lambda: gap(free()), lambda: gap(self._centers(step.coasting_poses))
+            dt,
+            lambda: gap(centers, rotations),
+            lambda: gap(free(), step.target_poses[..., :3, :3]),
+            lambda: gap(self._centers(step.coasting_poses), step.coasting_poses[..., :3, :3]),
         )
         return PreparedContact(centers, rotations, frame, anchor, surface, dt=dt, grip=self.grip, depth=depth, bounce=bounce)
 
@@ -206,19 +209,19 @@ class Contact(ContactLaws[PreparedContact]):
             carrier=None if self.carrier is None else self.carrier.take(worlds),
         )
 
-    def _depth(self, field: Field) -> Tensor:
-        """Of centres in the field of the solid, `[*batch, npoint]` [m]."""
+    def _depth(self, field: Field, frame: Tensor | None, rotations: Tensor) -> Tensor:
+        """Of centres in the field of the solid in its frame, on links with these rotations, `[*batch, npoint]` [m]."""
         return self.radius + self.margin - field.distance
 
     def touching(self, prepared: PreparedContact, placement: Placement) -> Touching:
         """See `ContactLaws`."""
         centers, frame = self._centers(placement.poses), prepared.frame
-        field = prepared.surface.field(_seen(frame, centers))
+        field = prepared.surface.field(seen(frame, centers))
         normal, bend = field.direction, None if field.flat else lambda: field.bend
         if frame is not None:
             normal = turned(frame[..., :3], normal)
             bend = None if field.flat else lambda: frame[..., :3] @ field.bend @ frame[..., :3].mT
-        depth, moved = prepared.raised(self._depth(field)), centers - prepared.centers
+        depth, moved = prepared.raised(self._depth(field, frame, placement.poses[..., :3, :3])), centers - prepared.centers
         if prepared.anchor is not None:
             moved = moved + prepared.anchor
         radius = turn = None
@@ -251,25 +254,27 @@ class Contact(ContactLaws[PreparedContact]):
     def _outlook(self, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
         velocity = self.grouping.mapped(motion.rates, self.position)
         acceleration = self.grouping.mapped(motion.accelerations, self.position)
-        if self.rounded:  # as in the slip: the surface moves by −ρ φ × n beside its centre
-            out = self.radius[..., None] * contact.at.normal
+        if self.rounded:  # as in the slip: the surface moves by φ × s beside its centre
+            out = contact.at.centers - contact.at.points
             velocity = velocity - cross(self.grouping.picked(motion.twists[..., :3]), out)
             acceleration = acceleration - cross(self.grouping.picked(motion.drifts[..., :3]), out)
         return contact_outlook(contact, velocity, acceleration)
 
+    def _frame(self, time: Tensor) -> Tensor | None:
+        """The solid's `[*batch, 1, 3, 4]` at a time `[*batch]` [s]; None: the world's."""
+        return None if self.carrier is None else self.carrier.pose(time)[..., None, :3, :]
+
     def depth(self, placement: Placement, time: Tensor | None = None) -> Tensor:
         """Penetration depth of every candidate [m] `[*batch, npoint]`, < 0 where apart, from the solid as it stands at `time`
         `[*batch]` [s], or at the start."""
-        centers, frame = self._centers(placement.poses), None
-        if self.carrier is not None:
-            frame = self.carrier.pose(centers.new_zeros(()) if time is None else time)[..., None, :3, :]
-        return self._depth(self.surface.field(_seen(frame, centers)))
+        centers, frame = self._centers(placement.poses), self._frame(placement.q.new_zeros(()) if time is None else time)
+        return self._depth(self.surface.field(seen(frame, centers)), frame, placement.poses[..., :3, :3])
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
         return self.normal_force.energy(self.depth(placement, time)).sum(-1)
 
 
-def _seen(frame: Tensor | None, points: Tensor) -> Tensor:
+def seen(frame: Tensor | None, points: Tensor) -> Tensor:
     """World points in a frame `[*batch, 1, 3, 4]`, or themselves."""
     return points if frame is None else turned(frame[..., :3].mT, points - frame[..., 3])

@@ -107,12 +107,15 @@ class ContactLaws(ABC, Generic[P]):
         friction = None if self.friction is None else self.friction.take(worlds)
         return replaced(self, normal_force=self.normal_force.take(worlds), friction=friction)
 
+    def pressing(self, prepared: P) -> NormalForce:
+        """The normal force of every candidate in the prepared step."""
+        if self.restitution is None or prepared.bounce is None:
+            return self.normal_force
+        return self.restitution.stiffened(self.normal_force, prepared.bounce)
+
     def force(self, prepared: P, placement: Placement) -> ContactForce:
         """The forces on the candidates at a placement that ends the prepared step."""
-        law = self.normal_force
-        if self.restitution is not None and prepared.bounce is not None:
-            law = self.restitution.stiffened(law, prepared.bounce)
-        during = law.during(prepared.depth, prepared.dt)
+        during = self.pressing(prepared).during(prepared.depth, prepared.dt)
         return ContactForce(self.touching(prepared, placement), during, self.friction, prepared.dt, prepared.grip)
 
     def points(self, prepared: P, placement: Placement) -> ContactPoints:

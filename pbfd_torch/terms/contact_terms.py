@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.ball_box_pairs import BallBoxPairs
 from pbfd_torch.contact.candidates import Finder
+from pbfd_torch.contact.curved_pairs import RIMS, CurvedPairs
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.hazards import Overflow
 from pbfd_torch.contact.obstacle import Obstacle
@@ -25,12 +26,14 @@ from pbfd_torch.contact.pairing import friction_between, touch
 from pbfd_torch.contact.polytope import polytope_of
 from pbfd_torch.contact.polytope_pairs import POINTS, PolytopePairs
 from pbfd_torch.contact.round_pairs import Round, RoundPairs
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Curved, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_body_contact import CurvedBodyContact
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
@@ -126,12 +129,14 @@ class _Builder:
         terms: list[Term] = []
         for obstacle in self.obstacles:
             near = [c for k, c in enumerate(self.colliders) if self._touches(k, obstacle)]
-            if touching := [c for c in near if _by_points(c, obstacle)]:
-                contact = Contact.between(
-                    self.articulation, touching, obstacle, self.normal_force, self.rules.friction, self.rules.restitution
-                )
-                mu = [friction_between(c, obstacle) for c in touching for _ in c.shape.candidates()[1]]
-                terms.append(dataclasses.replace(contact, grip=self._tensor(mu)))
+            by_points = [c for c in near if _by_points(c, obstacle)]
+            for kind, curved in ((CurvedContact, True), (Contact, False)):
+                if touching := [c for c in by_points if isinstance(c.shape, Curved) is curved]:
+                    contact = kind.between(
+                        self.articulation, touching, obstacle, self.normal_force, self.rules.friction, self.rules.restitution
+                    )
+                    mu = [friction_between(c, obstacle) for c in touching for _ in range(_candidates(c))]
+                    terms.append(dataclasses.replace(contact, grip=self._tensor(mu)))
         return terms
 
     def _touches(self, k: int, obstacle: HalfSpace | Obstacle) -> bool:
@@ -159,7 +164,7 @@ class _Builder:
             extent[part.body] = torch.maximum(extent[part.body], _extent(part))
         carriers = tuple(x.carrier(self.articulation.dtype, self.articulation.device) for x in solids)
         return [
-            BodyContact(
+            (CurvedBodyContact if isinstance(finder, CurvedPairs) else BodyContact)(
                 finder=finder,
                 obstacles=carriers,
                 extent=extent.to(mu),
@@ -225,6 +230,7 @@ class _Builder:
         like = torch.zeros((), dtype=self.articulation.dtype, device=self.articulation.device)
         rounds: list[tuple[int, Round, Round]] = []
         balls: list[tuple[int, _Part, _Part]] = []
+        curved: list[tuple[int, int, int]] = []
         others: list[tuple[int, int, int]] = []
         for k, (a, b) in enumerate(pairs):
             one, other = parts[a], parts[b]
@@ -235,6 +241,8 @@ class _Builder:
                 balls.append((k, one, other))
             elif isinstance(other.shape, Sphere) and isinstance(one.shape, Box):
                 balls.append((k, other, one))
+            elif isinstance(one.shape, Curved) or isinstance(other.shape, Curved):
+                curved.append((k, a, b))
             else:
                 others.append((k, a, b))
         finders: list[Finder] = []
@@ -242,25 +250,32 @@ class _Builder:
             finders.append(RoundPairs.of(rounds, self._slots(3 * len(rounds)), like))
         if balls:
             finders.append(_ball_boxes(balls, self._slots(len(balls)), like))
-        if others:
-            used = sorted({x for _, a, b in others for x in (a, b)})
-            place = {x: k for k, x in enumerate(used)}
-            finders.append(
-                PolytopePairs.of(
-                    [(k, place[a], place[b]) for k, a, b in others],
-                    [parts[x].body for x in used],
-                    torch.stack([parts[x].frame for x in used]).to(like),
-                    [polytope_of(parts[x].shape) for x in used],
-                    [isinstance(parts[x].shape, Box) for x in used],
-                    self._slots(POINTS * len(others)),
+        for kind, some, points in ((PolytopePairs, others, POINTS), (CurvedPairs, curved, POINTS + RIMS)):
+            if some:
+                used = sorted({x for _, a, b in some for x in (a, b)})
+                place = {x: k for k, x in enumerate(used)}
+                finders.append(
+                    kind.of(
+                        [(k, place[a], place[b]) for k, a, b in some],
+                        [parts[x].body for x in used],
+                        torch.stack([parts[x].frame for x in used]).to(like),
+                        [polytope_of(parts[x].shape) for x in used],
+                        [isinstance(parts[x].shape, Box) for x in used],
+                        self._slots(points * len(some)),
+                    )
                 )
-            )
         return finders
 
 
 def _by_points(collider: Collider, obstacle: HalfSpace | Obstacle) -> bool:
     """Whether candidate points of the collider say all there is to say about its contact with the obstacle."""
     return isinstance(obstacle, HalfSpace) or not isinstance(obstacle.shape, Shape) or isinstance(collider.shape, Sphere | Point)
+
+
+def _candidates(collider: Collider) -> int:
+    """How many a collider has against one obstacle."""
+    shape = collider.shape
+    return len(shape.supports().lying) if isinstance(shape, Curved) else len(shape.candidates()[1])
 
 
 def _solid(one: Collider, other: Collider) -> bool:

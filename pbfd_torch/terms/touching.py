@@ -48,6 +48,21 @@ class Touching:
     bend: Callable[[], Tensor] | None
     steepness: Tensor | None = None
 
+    @cached_property
+    def shift(self) -> Tensor:
+        """∂c/∂W by the twist W = (ω, v) of the body about the world origin, `[*, n, 3, 6]`."""
+        return shifting(self.centers)
+
+    @cached_property
+    def tilt(self) -> Tensor | None:
+        """∂n/∂W `[*, n, 3, 6]`, None where the solids are flat."""
+        return None if self.bend is None else self.bend() @ self.shift
+
+    @cached_property
+    def sinks(self) -> Tensor:
+        """−∂d/∂W `[*, n, 6]`."""
+        return self.sinking(self.shift)
+
     def sinking(self, velocity: Tensor) -> Tensor:
         """How fast the depth falls for centres that move like this, `[*, n, 3, k]` → `[*, n, k]`."""
         speed = rows(self.normal, velocity)
@@ -75,21 +90,34 @@ class Touching:
         """p `[*, n, 3]`."""
         return self.centers if self.radius is None else self.centers - self.radius[..., None] * self.normal
 
+    @property
+    def travel_slope(self) -> Tensor:
+        """∂m/∂W `[*, n, 3, 6]`."""
+        move = self.shift
+        if self.radius is None or self.turn is None:
+            return move
+        roll = self.radius[..., None, None] * (skew(self.normal) @ log_jacobian_left(self.turn))
+        move = torch.cat((move[..., :3] + roll, move[..., 3:]), -1)
+        return move if self.tilt is None else move - self.radius[..., None, None] * (skew(self.turn) @ self.tilt)
+
     @cached_property
     def slip_slope(self) -> Tensor:
-        """∂u/∂W by the twist W = (ω, v) of the body about the world origin, `[*, n, 3, 6]`."""
-        shift = shifting(self.centers)
-        move = shift
-        if self.radius is not None and self.turn is not None:
-            roll = self.radius[..., None, None] * (skew(self.normal) @ log_jacobian_left(self.turn))
-            move = torch.cat((shift[..., :3] + roll, shift[..., 3:]), -1)
-        if self.bend is None:
+        """∂u/∂W `[*, n, 3, 6]`."""
+        move = self.travel_slope
+        if self.tilt is None:
             return move - outer(self.normal, rows(self.normal, move))
-        turned = self.bend() @ shift  # ∂n/∂W
-        if self.radius is not None and self.turn is not None:
-            move = move - self.radius[..., None, None] * (skew(self.turn) @ turned)
         along = dot(self.normal, self.travel)[..., None, None]
-        return move - outer(self.normal, rows(self.normal, move) + rows(self.travel, turned)) - along * turned
+        return move - outer(self.normal, rows(self.normal, move) + rows(self.travel, self.tilt)) - along * self.tilt
+
+    def wandering(self, force: Tensor) -> Tensor | None:
+        """How the torque of a force `[*, n, 3]` answers W because it does not act on one material point, `[*, n, 3, 6]`; None: it
+        does."""
+        if self.radius is None:
+            return None
+        arm = self.radius[..., None, None]
+        pull = outer(self.normal, force)
+        moved = torch.cat((arm * trace_minus(pull), torch.zeros_like(pull)), -1)
+        return moved if self.tilt is None else moved - arm * (skew(force) @ self.tilt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +198,10 @@ class ContactForce:
         """−∂f/∂W `[*, n, 3, 6]`."""
         at = self.at
         by_depth, by_size = self._normal_slopes
-        shift = shifting(at.centers)
-        sinks = at.sinking(shift)  # −∂d/∂W
+        sinks = at.sinks
         answer = outer(at.normal, by_depth[..., None] * sinks)
-        if at.bend is not None:
-            answer = answer - self.normal[..., None, None] * (at.bend() @ shift)
+        if at.tilt is not None:
+            answer = answer - self.normal[..., None, None] * at.tilt
         if self._drag_slopes is None:
             return answer
         drag, drag_by_depth, drag_by_size = self._drag_slopes
@@ -189,14 +216,8 @@ class ContactForce:
         """How the wrench of every candidate about the world origin answers W, `[*, n, 6, 6]`, the part left out that a constant
         force on a material point at p has (`Balance.jacobian` adds it)."""
         at, answer = self.at, self.answer()
-        torque = skew(at.points) @ answer
-        if at.radius is not None:  # the point of application moves with the centre, not with the surface
-            arm = at.radius[..., None, None]
-            pull = outer(at.normal, self.force)
-            torque = torque + torch.cat((arm * trace_minus(pull), torch.zeros_like(pull)), -1)
-            if at.bend is not None:
-                torque = torque - arm * (skew(self.force) @ at.bend() @ shifting(at.centers))
-        return torch.cat((torque, answer), -2)
+        torque, wandering = skew(at.points) @ answer, at.wandering(self.force)
+        return torch.cat((torque if wandering is None else torque + wandering, answer), -2)
 
     def factors(self) -> list[tuple[Tensor, Tensor]]:
         """`stiffness` of points at flat solids as a sum of products of `arm(c, l)` and `arm(c, r)`: the pairs l, r `[*, n, 3]`. The
