@@ -26,7 +26,7 @@ from tests.bodies import GRAVITY
 R, HALF = 0.1, 0.04  # radius and half length [m]
 WHEEL, BALL = Cylinder(R, HALF), Ellipsoid((R, R, R))
 UPRIGHT = (math.pi / 2, 0.0, 0.0)  # turns a wheel's axis from z to y
-FLOORS = {
+FLOORS: dict[str, HalfSpace | Obstacle] = {
     "plane": HalfSpace(),
     "box": Obstacle("floor", Box((20.0, 1.0, 0.1)), (0.0, 0.0, -0.1)),
     "hull": Obstacle("floor", ConvexHull(Box((20.0, 1.0, 0.1)).candidates()[0]), (0.0, 0.0, -0.1)),
