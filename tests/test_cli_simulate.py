@@ -175,12 +175,13 @@ def test_seed_shakes_all_worlds_but_the_first(pbfd: Pbfd) -> None:
 
 @pytest.mark.parametrize("choice", list(Friction))
 def test_friction_laws(pbfd: Pbfd, choice: Friction) -> None:
-    """Coulomb's law stops the box after v²/(2 μ g); without friction it slides on at 1 m/s; a drag that grows with the speed, and
-    is Coulomb's at 1 m/s, lets it go farther than Coulomb's; the derived law's is proportional to the speed: twice as far."""
+    """Coulomb's law, with anchors or without, stops the box after v²/(2 μ g); without friction it slides on at 1 m/s; a drag that
+    grows with the speed, and is Coulomb's at 1 m/s, lets it go farther than Coulomb's; the derived law's is proportional to the
+    speed: twice as far."""
     metrics = pbfd("simulate", "box-slide", "--friction", choice.value, "--json").data["metrics"]
     distance, exact = metrics["stop_distance_m"], metrics["stop_distance_exact_m"]
     ratio = [d / e for d, e in zip(distance, exact, strict=True)]
-    if choice is Friction.COULOMB:
+    if choice in (Friction.COULOMB, Friction.ANCHORED):
         assert ratio == pytest.approx([1] * 5, abs=0.01)
     elif choice is Friction.NONE:
         assert distance == pytest.approx([1.5] * 5, abs=1e-9)

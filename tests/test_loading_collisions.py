@@ -22,6 +22,7 @@ from pbfd_torch.loading import Robot, load_mjcf, load_robot, load_srdf_exclusion
 from pbfd_torch.loading.scene import robot_scene
 from pbfd_torch.models.robots import robot_setup
 from pbfd_torch.simulator import Simulator
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
@@ -347,3 +348,17 @@ def test_bad_srdf(tmp_path: Path, text: str, words: str) -> None:
     file.write_text(text)
     with pytest.raises(ModelError, match=words):
         load_srdf_exclusions(file)
+
+
+def test_friction_of_a_robot_scene(tmp_path: Path) -> None:
+    """The law is the one that is given, the μ of every pair the file's."""
+    file = tmp_path / "box.xml"
+    file.write_text(
+        "<mujoco><worldbody><geom type='plane' size='1 1 1' friction='.3'/>"
+        "<body><freejoint/><geom type='box' size='.1 .1 .1' friction='.4'/></body></worldbody></mujoco>"
+    )
+    law = AnchoredFriction(1.0)
+    (contact,) = (x for x in robot_scene(load_robot(file), friction=law).terms if isinstance(x, Contact))
+    assert contact.friction is law
+    assert contact.grip is not None
+    assert contact.grip.tolist() == [0.4] * 8

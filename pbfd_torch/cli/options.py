@@ -21,6 +21,7 @@ from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnSquares, jtj_lm, lbfgs, lm
 from pbfd_torch.stepping.stepper import Solver
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction
@@ -52,6 +53,7 @@ class Schedule(enum.StrEnum):
 
 class Friction(enum.StrEnum):
     COULOMB = "coulomb"
+    ANCHORED = "anchored"
     PBFD_PRINTED = "pbfd"
     PBFD_DERIVED = "pbfd-derived"
     NONE = "none"
@@ -173,5 +175,7 @@ def with_friction(setup: Setup, choice: Friction | None, dt: float) -> Setup:
 def _law(choice: Friction, contact: Contact | BodyContact, dt: float) -> FrictionLaw | None:
     if choice is Friction.NONE or not isinstance(contact.friction, DryFriction):
         return None
+    if choice is Friction.ANCHORED:
+        return AnchoredFriction(contact.friction.mu)
     base = PbfdFriction.as_printed(0.0) if choice is Friction.PBFD_PRINTED else PbfdFriction.as_derived(0.0)
     return base.calibrated(contact.friction.mu, contact.normal_force.stiffness, CALIBRATION_SPEED, dt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -15,16 +16,23 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.kinematics import place
 
 
-def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace | Obstacle] | None = None, penetration: float = 1e-3) -> Scene:
+def robot_scene(
+    robot: Robot,
+    obstacles: Sequence[HalfSpace | Obstacle] | None = None,
+    penetration: float = 1e-3,
+    friction: FrictionLaw | None = None,
+) -> Scene:
     """The robot with everything its file asks for, on its own obstacles or on `obstacles`.
 
-    C⊥ is chosen so that the whole weight on one point would rest `penetration` [m] deep; friction is Coulomb's, μ from the file."""
+    C⊥ is chosen so that the whole weight on one point would rest `penetration` [m] deep. friction: the law for μ = 1,
+    of which every pair has the file's μ; None: Coulomb's."""
     articulation = robot.articulation
     obstacles = robot.obstacles if obstacles is None else tuple(obstacles)
     weight = float(articulation.mass.sum()) * max(1.0, sum(x * x for x in robot.gravity) ** 0.5)
@@ -34,6 +42,8 @@ def robot_scene(robot: Robot, obstacles: Sequence[HalfSpace | Obstacle] | None =
     names = {*articulation.link_names, *(x.name for x in obstacles)}
     excluded = [pair for pair in robot.excluded if names.issuperset(pair)]  # others name obstacles of the file that are not here
     rules = ContactRules(NormalForce.for_weight(weight, penetration), excluded=excluded)
+    if friction is not None:
+        rules = dataclasses.replace(rules, friction=friction)
     terms += contact_terms(articulation, robot.colliders, obstacles, rules)
     gravity = torch.tensor(robot.gravity, dtype=articulation.dtype, device=articulation.device)
     return Scene(articulation, tuple(terms), gravity, robot.colliders, obstacles, robot.name, robot.visuals)
