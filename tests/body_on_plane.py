@@ -8,7 +8,8 @@ from torch import Tensor
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.terms.contact import Contact, ContactPoints
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.contact_laws import ContactPoints
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import LinkLoad
 from pbfd_torch.terms.normal_force import NormalForce

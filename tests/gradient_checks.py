@@ -28,6 +28,7 @@ from tests.random_trees import generator
 POSES = ("joint_frame", "link_frame", "carrier.start")
 AXES = ("joint_axis", "normal", "normals")
 FLOOR = 1e-3  # the end is of the size of 1, and so are its largest derivatives
+FORMS = (".form", ".axis")  # of curved candidates: those among them that are points have none to be differentiated by
 SHARED = (".normals", ".offsets", ".starts", ".ends", ".coefficients", ".origin", ".spacing")
 PRECISE = 1e-13  # of the weight: differences see the solver's tolerance
 
@@ -73,7 +74,7 @@ class Experiment:
         for name, x in found.items():
             if name.endswith((".lower", ".upper")) and not limits:
                 continue
-            if name.endswith(SHARED) or (name.endswith("1.radius") and not bool((x > 0).any())):
+            if name.endswith((*SHARED, *FORMS)) or (name.endswith("1.radius") and not bool((x > 0).any())):
                 continue
             own[name] = x
         return own

@@ -13,7 +13,7 @@ from torch import Tensor
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.motion import Conveyor, Lift, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Curved, Cylinder, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
@@ -22,6 +22,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.normal_force import NormalForce
@@ -55,7 +56,8 @@ def on(
     """A free body of 1 kg, by default a uniform box, with one collider, and one obstacle."""
     articulation = free_body(1.0, box_inertia(1.0, HALF) if inertia is None else inertia)
     colliders = [Collider("shape", "body", shape)]
-    contact = Contact.between(articulation, colliders, obstacle, law, friction, restitution)
+    kind = CurvedContact if isinstance(shape, Curved) else Contact
+    contact = kind.between(articulation, colliders, obstacle, law, friction, restitution)
     return Scene(articulation, (Inertia(), contact), down(), colliders)
 
 

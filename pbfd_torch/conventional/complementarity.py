@@ -24,7 +24,7 @@ from torch import Tensor
 
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.solvers.per_world import chosen
-from pbfd_torch.terms.touching import outer
+from pbfd_torch.tensors.vectors import outer
 
 SOFTEST = 1e-2  # ρ, in units of 1/w, w the constraint's own entry of GGᵀ
 LENGTHS = (1.0, 0.7, 0.5, 0.3, 0.15, 0.07, 0.03, 0.01, 0.003, 0.001)  # of steps along a Newton direction, all of them tried

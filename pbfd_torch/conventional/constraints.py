@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.vectors import dot
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
-from pbfd_torch.terms.touching import Touching, arm, dot
+from pbfd_torch.terms.touching import Touching, arm
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement
 

@@ -10,7 +10,8 @@ from torch import Tensor
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.terms.body_contact import BodyContact
-from pbfd_torch.terms.contact import Contact, ContactPoints
+from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.contact_laws import ContactPoints
 from pbfd_torch.terms.touching import shifting
 from pbfd_torch.tree.kinematics import link_jacobians
 

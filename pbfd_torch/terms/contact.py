@@ -25,7 +25,6 @@ from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, turned
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
-from pbfd_torch.terms.contact_laws import ContactPoints as ContactPoints
 from pbfd_torch.terms.contact_outlook import contact_outlook
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.grouping import Grouping

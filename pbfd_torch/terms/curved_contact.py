@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.vectors import applied, turned
-from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact import Contact, PreparedContact, seen
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import StepContext
@@ -45,8 +45,8 @@ class CurvedContact(Contact):
     """Ellipsoids against one solid; their `radius` is zero.
 
     Attributes:
-        form: `[npoint, 3, 3]` M in the link's frame [m²], see `supported`.
-        axis: `[npoint, 3]` in the link's frame: of the rim that a candidate belongs to.
+        form: `[*, npoint, 3, 3]` M in the link's frame [m²], see `supported`.
+        axis: `[*, npoint, 3]` in the link's frame: of the rim that a candidate belongs to.
         lying: `[npoint]` see `lying`.
     """
 
@@ -97,6 +97,10 @@ class CurvedContact(Contact):
             axis=tensor([x.axes @ turn.T for x, turn in zip(supports, turns, strict=True)]),
             lying=torch.as_tensor(np.concatenate([x.lying for x in supports]), device=articulation.device),
         )
+
+    def take(self, worlds: Worlds) -> Self:
+        """See `Contact`."""
+        return replaced(super().take(worlds), form=worlds.pick(self.form, 3), axis=worlds.pick(self.axis, 2))
 
     @fact("radius")
     def rounded(self) -> bool:

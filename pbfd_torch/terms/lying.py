@@ -18,7 +18,7 @@ FLAT, STEEP = 0.02, 0.1
 def share_of(lying: Tensor, axis: Tensor, normal: Tensor) -> Tensor:
     """Of its normal force that each candidate gives, from 0 to 1, `[*, n]`. lying: 1 for what counts where a rim lies flat, −1 for
     what counts where it does not, 0 for what always does, `[*, n]`; axis, normal: unit, `[*, n, 3]`."""
-    sine = (1 - dot(axis, normal).square()).clamp_min(0).sqrt()
-    x = ((sine - FLAT) / (STEEP - FLAT)).clamp(0, 1)
+    square = 1 - dot(axis, normal).square()  # sin² α: its root has no derivative where a rim lies flat
+    x = ((square - FLAT**2) / (STEEP**2 - FLAT**2)).clamp(0, 1)
     steep = x * x * (3 - 2 * x)
     return torch.where(lying == 0, 1.0, torch.where(lying > 0, 1 - steep, steep))

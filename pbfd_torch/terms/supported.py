@@ -16,7 +16,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import cross, rotated, rows
+from pbfd_torch.tensors.vectors import cross, dot, rotated, rows
 from pbfd_torch.terms.touching import Touching
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
 
@@ -25,7 +25,7 @@ _POINT = 1e-12  # [m] a smaller reach is that of a point
 
 def reaching(form: Tensor, normal: Tensor) -> Tensor:
     """h `[*, n]` [m] of forms M `[*, n, 3, 3]` [m²] towards planes with normals `[*, n, 3]`."""
-    return (rotated(form, normal) * normal).sum(-1).clamp_min(_POINT**2).sqrt()
+    return dot(rotated(form, normal), normal).clamp_min(_POINT**2).sqrt()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,8 +55,9 @@ class Supported(Touching):
 
     @cached_property
     def arm(self) -> Tensor:
-        """s `[*, n, 3]` [m]."""
-        return -self._spread / self._reach[..., None]
+        """s `[*, n, 3]` [m]; that of a point is zero, whatever its form is differentiated by."""
+        solid = (self._reach > _POINT)[..., None]
+        return torch.where(solid, -self._spread / torch.where(solid, self._reach[..., None], 1.0), 0.0)
 
     @property
     def points(self) -> Tensor:

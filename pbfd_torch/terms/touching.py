@@ -18,9 +18,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import cross, cross_coordinates, rows, trace_minus
-from pbfd_torch.tensors.vectors import dot as dot
-from pbfd_torch.tensors.vectors import outer as outer
+from pbfd_torch.tensors.vectors import cross, cross_coordinates, dot, outer, rows, trace_minus
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
