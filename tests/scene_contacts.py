@@ -23,7 +23,8 @@ def start(setup: Setup) -> Placement:
 
 def depth(setup: Setup) -> Tensor:
     """Penetration depth of every candidate at the start `[worlds, npoint]`."""
-    return contact_of(setup).depth(start(setup))
+    contacts = [term for term in setup.scene.terms if isinstance(term, Contact)]
+    return torch.cat([term.depth(start(setup)) for term in contacts], -1)
 
 
 def mu(setup: Setup) -> list[float]:

@@ -208,7 +208,7 @@ CONTACTS = (
     TermCase("Coulomb, sticking, rolling", lambda s: contact(s, STICKING, shapes=ROUND)),
     TermCase("Coulomb, sliding, rolling", lambda s: contact(s, SLIDING, shapes=ROUND)),
     TermCase("Coulomb, sliding, all shapes", lambda s: contact(s, SLIDING, shapes=(*ROUND, Point(), Box((0.1, 0.2, 0.05))))),
-    TermCase("contact, curved", lambda s: contact(s, None, shapes=CURVED), "energy"),
+    TermCase("contact, α = 3, curved", lambda s: contact(s, None, 3.0, CURVED), "energy"),
     TermCase("contact, curved, margin, letting go", lambda s: contact(s, None, 3.0, CURVED, 0.03, QUICK), "energy"),
     TermCase("Coulomb, sticking, curved", lambda s: contact(s, STICKING, shapes=CURVED)),
     TermCase("Coulomb, sliding, curved", lambda s: contact(s, SLIDING, shapes=CURVED)),

@@ -255,8 +255,11 @@ class Contact(ContactLaws[PreparedContact]):
         acceleration = self.grouping.mapped(motion.accelerations, self.position)
         if self.rounded:  # as in the slip: the surface moves by φ × s beside its centre
             out = contact.at.centers - contact.at.points
-            velocity = velocity - cross(self.grouping.picked(motion.twists[..., :3]), out)
+            spin = self.grouping.picked(motion.twists[..., :3])
+            velocity = velocity - cross(spin, out)
             acceleration = acceleration - cross(self.grouping.picked(motion.drifts[..., :3]), out)
+            if (bulge := contact.at.bulge(spin)) is not None:
+                acceleration = acceleration - bulge[..., None] * contact.at.normal
         return contact_outlook(contact, velocity, acceleration)
 
     def _frame(self, time: Tensor) -> Tensor | None:

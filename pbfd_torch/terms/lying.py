@@ -20,5 +20,5 @@ def share_of(lying: Tensor, axis: Tensor, normal: Tensor) -> Tensor:
     what counts where it does not, 0 for what always does, `[*, n]`; axis, normal: unit, `[*, n, 3]`."""
     square = 1 - dot(axis, normal).square()  # sin² α: its root has no derivative where a rim lies flat
     x = ((square - FLAT**2) / (STEEP**2 - FLAT**2)).clamp(0, 1)
-    steep = x * x * (3 - 2 * x)
+    steep = x * x * x * (10 - x * (15 - 6 * x))  # twice continuously differentiable
     return torch.where(lying == 0, 1.0, torch.where(lying > 0, 1 - steep, steep))

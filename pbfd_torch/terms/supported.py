@@ -104,6 +104,12 @@ class Supported(Touching):
         move = torch.cat((self.shift[..., :3] - roll, self.shift[..., 3:]), -1)
         return move + skew(self._rolled) @ self._arm_slope
 
+    def bulge(self, spin: Tensor) -> Tensor:
+        """See `Touching`: h'' less what ω̇ makes of it, with η' = −ω × n: (η'ᵀM η' − (s · η')²)/h − n · (ω × (ω × s))."""
+        turning = -cross(spin, self.normal.expand_as(spin))
+        spread = dot(rotated(self.form, turning), turning) - dot(self.arm, turning).square()
+        return spread / self._reach - dot(cross(spin, cross(spin, self.arm)), self.normal)
+
     def wandering(self, force: Tensor) -> Tensor:
         """See `Touching`: p moves by δs where a material point there would by ω × s."""
         beside = torch.cat((skew(self.arm), torch.zeros_like(self.form)), -1)

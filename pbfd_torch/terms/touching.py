@@ -107,6 +107,11 @@ class Touching:
         along = dot(self.normal, self.travel)[..., None, None]
         return move - outer(self.normal, rows(self.normal, move) + rows(self.travel, self.tilt)) - along * self.tilt
 
+    def bulge(self, spin: Tensor) -> Tensor | None:
+        """How much more the depth's growth is accelerated than that of a point which the body carries along without turning it,
+        `[*, n]` [m/s²], where the body spins at `[*, n, 3]` [rad/s]; None: not at all, as the surface of a ball."""
+        return None
+
     def wandering(self, force: Tensor) -> Tensor | None:
         """How the torque of a force `[*, n, 3]` answers W because it does not act on one material point, `[*, n, 3, 6]`; None: it
         does."""
