@@ -37,7 +37,7 @@ class CurvedSlots(Slots):
 
 @dataclass(frozen=True, eq=False)
 class CurvedPairs(PolytopePairs):
-    """Pairs with at least one curved body."""
+    """Pairs of convex bodies of which some are curved."""
 
     def _manifolds(self, poses: Tensor, world: Tensor, row: Tensor, moves: Tensor) -> tuple[Manifold, Tensor]:
         found, gap = super()._manifolds(poses, world, row, moves)

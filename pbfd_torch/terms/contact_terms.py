@@ -230,7 +230,6 @@ class _Builder:
         like = torch.zeros((), dtype=self.articulation.dtype, device=self.articulation.device)
         rounds: list[tuple[int, Round, Round]] = []
         balls: list[tuple[int, _Part, _Part]] = []
-        curved: list[tuple[int, int, int]] = []
         others: list[tuple[int, int, int]] = []
         for k, (a, b) in enumerate(pairs):
             one, other = parts[a], parts[b]
@@ -241,8 +240,6 @@ class _Builder:
                 balls.append((k, one, other))
             elif isinstance(other.shape, Sphere) and isinstance(one.shape, Box):
                 balls.append((k, other, one))
-            elif isinstance(one.shape, Curved) or isinstance(other.shape, Curved):
-                curved.append((k, a, b))
             else:
                 others.append((k, a, b))
         finders: list[Finder] = []
@@ -250,20 +247,22 @@ class _Builder:
             finders.append(RoundPairs.of(rounds, self._slots(3 * len(rounds)), like))
         if balls:
             finders.append(_ball_boxes(balls, self._slots(len(balls)), like))
-        for kind, some, points in ((PolytopePairs, others, POINTS), (CurvedPairs, curved, POINTS + RIMS)):
-            if some:
-                used = sorted({x for _, a, b in some for x in (a, b)})
-                place = {x: k for k, x in enumerate(used)}
-                finders.append(
-                    kind.of(
-                        [(k, place[a], place[b]) for k, a, b in some],
-                        [parts[x].body for x in used],
-                        torch.stack([parts[x].frame for x in used]).to(like),
-                        [polytope_of(parts[x].shape) for x in used],
-                        [isinstance(parts[x].shape, Box) for x in used],
-                        self._slots(points * len(some)),
-                    )
+        if others:
+            used = sorted({x for _, a, b in others for x in (a, b)})
+            place = {x: k for k, x in enumerate(used)}
+            # all in one term: what a term costs besides its candidates counts for more than what a round one costs
+            curved = any(isinstance(parts[x].shape, Curved) for x in used)
+            kind, points = (CurvedPairs, POINTS + RIMS) if curved else (PolytopePairs, POINTS)
+            finders.append(
+                kind.of(
+                    [(k, place[a], place[b]) for k, a, b in others],
+                    [parts[x].body for x in used],
+                    torch.stack([parts[x].frame for x in used]).to(like),
+                    [polytope_of(parts[x].shape) for x in used],
+                    [isinstance(parts[x].shape, Box) for x in used],
+                    self._slots(points * len(others)),
                 )
+            )
         return finders
 
 
