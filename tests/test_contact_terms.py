@@ -110,7 +110,7 @@ def test_obstacles_that_meet() -> None:
     rules = ContactRules(excluded=[("stone", "foot"), ("hand", "ground")], between_links=False)
     plane, round_pairs = contact_terms(a, capsules, (HalfSpace(), stone), rules)
     assert isinstance(plane, Contact)
-    assert set(plane.names) == {"upper", "plate", "lower", "foot", "free"}
+    assert {one for one, _ in plane.pairs} == {"upper", "plate", "lower", "foot", "free"}
     assert names_met([round_pairs], a, [stone]) == pairs("stone-upper stone-plate stone-lower stone-hand stone-free")
 
 

@@ -53,7 +53,7 @@ def names_met(robot: Robot) -> set[frozenset[str]]:
             first, second = (of_bodies[x].tolist() for x in (finder.first, finder.second))
             found |= {frozenset((names[a], names[b])) for a, b in zip(first, second, strict=True)}
         elif isinstance(term, Contact):
-            found |= {frozenset((link[name], "floor")) for name in term.names}
+            found |= {frozenset((link[name], "floor")) for name, _ in term.pairs}
     return found
 
 

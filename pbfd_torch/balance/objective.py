@@ -153,19 +153,20 @@ class BalanceObjective:
             self.articulation, terms, self.step, self.memory, self.prepared, self.scale, self.extent, self.rounding
         )
 
-    def aftermath(self, q: Tensor) -> Aftermath:
-        """What a step that ended at q leaves behind."""
-        hazards = torch.zeros_like(q[..., 0], dtype=torch.int32)
+    def aftermath(self, placement: Placement) -> Aftermath:
+        """What a step that ended at a placement leaves behind."""
+        hazards = torch.zeros_like(placement.q[..., 0], dtype=torch.int32)
         watching = any(isinstance(term, Hazardous) for term in self.terms)
         if not watching and not any(x.numel() for x in self.memory):
             return Aftermath(self.memory, hazards)
-        placement = place(self.articulation, q)
+        before, now = (x.poses[..., :3, :3] for x in (self.step.previous, placement))
+        turned = (before * now).sum((-2, -1)) < 1  # the trace of the rotation between them is 1 + 2 cos of its angle
         memory = []
         for term, prepared in zip(self.terms, self.prepared, strict=True):
             if isinstance(term, Remembering):
                 memory.append(term.remembered(prepared, placement))
             if isinstance(term, Hazardous):
-                hazards = hazards | term.hazards(prepared, placement)
+                hazards = hazards | term.hazards(prepared, placement, turned)
         return Aftermath(tuple(memory), hazards)
 
     def forces(self, q: Tensor) -> tuple[Tensor, Tensor]:

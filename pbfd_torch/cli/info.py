@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,20 @@ def describe(robot: Robot) -> dict[str, Any]:
         "links": links,
         "joints": joints,
         "actuators": list(robot.actuators.names) if robot.actuators else [],
+        "unlimited_actuators": _unlimited(robot),
         "obstacles": [_obstacle(x) for x in robot.obstacles],
         "keyframes": list(robot.keyframes),
         "terms": [type(term).__name__ for term in robot.joint_terms],
         "not_modelled": list(robot.not_modelled),
     }
+
+
+def _unlimited(robot: Robot) -> list[str]:
+    """Actuators whose force nothing bounds."""
+    if robot.actuators is None:
+        return []
+    largest = robot.actuators.largest(robot.articulation).tolist()
+    return [name for name, force in zip(robot.actuators.names, largest, strict=True) if math.isinf(force)]
 
 
 def _obstacle(obstacle: HalfSpace | Obstacle) -> dict[str, Any]:
@@ -118,6 +128,11 @@ def _print(contents: dict[str, Any]) -> None:
     Console(markup=False, emoji=False).print(links, "", joints, "", sep="\n")
     for key in ("actuators", "keyframes", "terms"):
         print(f"{key}: {', '.join(contents[key]) or 'none'}")
+    if unlimited := contents["unlimited_actuators"]:
+        print(
+            f"without a largest force: {', '.join(unlimited)}\n"
+            "  (contacts are not made firm enough for them: watch too_deep_steps, or give ctrlrange, forcerange or effort)"
+        )
     for obstacle in contents["obstacles"]:
         place = (
             f"at {obstacle['offset_m']:.4g} m along {obstacle['normal']}"

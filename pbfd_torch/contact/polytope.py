@@ -7,6 +7,7 @@ segment and a sphere a rounded point. Flat hulls are polygons with two opposite 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -16,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.contact.shapes import Curved, Points, Rim, Shape
+from pbfd_torch.contact.shapes import Curved, Point, Points, Rim, Shape
 from pbfd_torch.errors import InputError
 
 Indices = NDArray[np.int64]
@@ -80,6 +81,11 @@ def polytope_of(shape: Shape) -> Polytope:
 def thickness_of(shape: Shape) -> float:
     """The least distance [m] between two parallel planes that hold a convex shape between them."""
     return polytope_of(shape).thickness
+
+
+def half_thickness(shape: Shape) -> float:
+    """Half of it [m]; infinite for a single point, which has none that counts."""
+    return math.inf if isinstance(shape, Point) else 0.5 * thickness_of(shape)
 
 
 def _hull(points: Points) -> tuple[Points, list[Indices]]:

@@ -48,6 +48,7 @@ class Recorder(Records):
         none = q.new_zeros((*q.shape[:-1], 0, 3))
         entries = self._state(placement, v, time) | {
             "hazards": torch.zeros_like(solution.status),
+            "suspect": torch.full_like(solution.status, -1),
             "contact_point": torch.cat([none, *(x.points for x in at)], -2),
             "contact_depth": torch.cat([none[..., 0], *(x.depth for x in at)], -1),
             "contact_normal": torch.cat([none, *(x.normal for x in at)], -2),

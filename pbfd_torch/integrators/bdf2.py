@@ -102,7 +102,7 @@ class Bdf2:
         """See `Integrator`."""
         step, push = objective.step, objective.push(q)
         end = FourPoses(
-            **after(objective, q),
+            **after(objective, place(objective.articulation, q)),
             history=(step.previous.poses, *state.history[:2]),
             moves=(difference(objective.articulation, state.q, q), *state.moves[:2]),
             push=push,

@@ -254,7 +254,7 @@ def _ended(
     before = (inertia * state.v[..., None, :]).sum(-1)
     other = momentum - before - h * forces.smooth - (1 - share) * impulse
     (lag,) = _solved(inertia, -forces.ahead * other)
-    return Velocities(**after(objective, now.q), v=v, push=push, steady=share * push, lag=lag, average=average)
+    return Velocities(**after(objective, now), v=v, push=push, steady=share * push, lag=lag, average=average)
 
 
 def _solved(inertia: Tensor, *momenta: Tensor) -> tuple[Tensor, ...]:

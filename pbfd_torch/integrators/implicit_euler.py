@@ -87,7 +87,7 @@ class ImplicitEuler:
         gained = difference(a, state.q, q) / h - self.velocity(a, state, objective.step.dt)
         smooth = calm(objective, objective.step.previous, gained)[..., None]
         acceleration = torch.where(smooth, gained / h, 0.0)
-        return Positions(**after(objective, q), q_previous=state.q, acceleration=acceleration), None
+        return Positions(**after(objective, place(a, q)), q_previous=state.q, acceleration=acceleration), None
 
     def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
         """None: an easier step is good enough."""

@@ -139,10 +139,10 @@ def fresh(q: Tensor) -> dict[str, Any]:
     return {"q": q, "time": time, "hazards": torch.zeros_like(time, dtype=torch.int32)}
 
 
-def after(objective: BalanceObjective, q: Tensor) -> dict[str, Any]:
-    """The fields of the state after the step of an objective that ended at q."""
-    step, aftermath = objective.step, objective.aftermath(q)
-    return {"q": q, "time": step.time + step.dt, "hazards": aftermath.hazards, "memory": aftermath.memory}
+def after(objective: BalanceObjective, now: Placement) -> dict[str, Any]:
+    """The fields of the state after the step of an objective that ended at a placement."""
+    step, aftermath = objective.step, objective.aftermath(now)
+    return {"q": now.q, "time": step.time + step.dt, "hazards": aftermath.hazards, "memory": aftermath.memory}
 
 
 HARDEST = 3.0

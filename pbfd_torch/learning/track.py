@@ -30,7 +30,7 @@ class _Track(Records):
             evaluations=none,
             fallbacks=none[..., None].expand(*none.shape, len(FALLBACKS)),
         )
-        self._add(solution, seen | {"hazards": none})
+        self._add(solution, seen | {"hazards": none, "suspect": none - 1})
 
 
 def tracked(scene: Scene, dt: float, q: Tensor, v: Tensor, name: str) -> Rollout:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.balance.dynamics import mass_matrix
 from pbfd_torch.errors import ModelError
+from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings, checked_coefficient
@@ -39,17 +40,17 @@ class JointProperties:
 
 
 def articulate(
-    links: Sequence[Link], properties: dict[str, JointProperties], gravity: float, dtype: torch.dtype, device: torch.device | str
+    links: Sequence[Link], properties: dict[str, JointProperties], dtype: torch.dtype, device: torch.device | str
 ) -> tuple[Articulation, tuple[Term, ...]]:
     """The articulation and its joint terms, checked in 64 bits before they are rounded to `dtype`."""
     exact = Articulation.from_links(links)
-    require_inertia(exact, joint_terms(exact, properties, gravity))
+    require_inertia(exact, joint_terms(exact, properties))
     articulation = exact.to(dtype, device)
-    return articulation, joint_terms(articulation, properties, gravity)
+    return articulation, joint_terms(articulation, properties)
 
 
-def joint_terms(articulation: Articulation, properties: dict[str, JointProperties], gravity: float) -> tuple[Term, ...]:
-    """Armature, damping, springs, dry friction and limits, each only if some joint has it. `gravity`: its size [m/s²]."""
+def joint_terms(articulation: Articulation, properties: dict[str, JointProperties]) -> tuple[Term, ...]:
+    """Armature, damping, springs and dry friction, each only if some joint has it."""
     t = articulation.topology
     each = [properties.get(name, JointProperties()) for name in t.joint_names]
     for name, joint in zip(t.joint_names, each, strict=True):
@@ -72,9 +73,14 @@ def joint_terms(articulation: Articulation, properties: dict[str, JointPropertie
         terms.append(JointSprings(stiffness, rest))
     if friction.any():
         terms.append(JointDryFriction(friction))
-    if torch.isfinite(torch.cat((articulation.lower, articulation.upper))).any():
-        terms.append(JointLimits.for_articulation(articulation, gravity))
     return tuple(terms)
+
+
+def joint_limits(articulation: Articulation, actuators: Actuators | None, gravity: float) -> tuple[JointLimits, ...]:
+    """The limits, if some joint has one, as firm as its actuators need them. `gravity`: its size [m/s²]."""
+    if not bool(torch.isfinite(torch.cat((articulation.lower, articulation.upper))).any()):
+        return ()
+    return (JointLimits.for_articulation(articulation, gravity, actuators=actuators),)
 
 
 def require_inertia(articulation: Articulation, terms: Sequence[Term] = ()) -> None:

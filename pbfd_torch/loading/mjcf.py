@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.joint_terms import JointProperties, articulate
+from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
 from pbfd_torch.loading.mjcf_features import left_out
@@ -36,14 +36,14 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
     model = compile_mjcf(Path(path))
     with naming(str(path)):
         gravity = _gravity(model)
-        articulation, terms = articulate(_links(model), _properties(model), math.hypot(*gravity), dtype, device)
+        articulation, terms = articulate(_links(model), _properties(model), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
         collisions = mjcf_collisions(model)
     actuators = Actuators.from_list(articulation, drives) if drives else None
     return Robot(
         name=model.name,
         articulation=articulation,
-        joint_terms=terms,
+        joint_terms=(*terms, *joint_limits(articulation, actuators, math.hypot(*gravity))),
         actuators=actuators,
         colliders=collisions.colliders,
         obstacles=collisions.obstacles,

@@ -19,29 +19,30 @@ from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
-from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
 from pbfd_torch.tree.kinematics import place
 
 
 def robot_scene(
     robot: Robot,
     obstacles: Sequence[HalfSpace | Obstacle] | None = None,
-    penetration: float = 1e-3,
+    penetration: float | None = None,
     friction: FrictionLaw | None = None,
 ) -> Scene:
     """The robot with everything its file asks for, on its own obstacles or on `obstacles`.
 
-    C⊥ is chosen so that the whole weight on one point would rest `penetration` [m] deep. friction: the law for μ = 1,
-    of which every pair has the file's μ; None: Coulomb's."""
+    penetration: how deep the whole weight would rest on one point [m] > 0; None: every pair is as firm as its size, the weight and
+    the robot's actuators ask for (`firmness`). friction: the law for μ = 1, of which every pair has the file's μ; None: Coulomb's.
+    """
     articulation = robot.articulation
     obstacles = robot.obstacles if obstacles is None else tuple(obstacles)
-    weight = float(articulation.mass.sum()) * max(1.0, sum(x * x for x in robot.gravity) ** 0.5)
+    firm = None if penetration is None else default_stiffness(articulation, penetration)
     terms: list[Term] = [Inertia(), *robot.joint_terms]
     if robot.actuators is not None:
         terms.append(robot.actuators)
     names = {*articulation.link_names, *(x.name for x in obstacles)}
     excluded = [pair for pair in robot.excluded if names.issuperset(pair)]  # others name obstacles of the file that are not here
-    rules = ContactRules(NormalForce.for_weight(weight, penetration), excluded=excluded)
+    rules = ContactRules(firm, excluded=excluded, actuators=robot.actuators)
     if friction is not None:
         rules = dataclasses.replace(rules, friction=friction)
     terms += contact_terms(articulation, robot.colliders, obstacles, rules)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.joint_terms import JointProperties, articulate
+from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.report import listing, naming, warn_not_modelled
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.loading.urdf_colliders import urdf_collisions
@@ -55,15 +55,16 @@ def load_urdf(
         links, standing = _links(file, root, order, free)
         joints = [x.data for x in file.joints.values()]
         properties = {j.name: _properties(j) for j in joints if j.type in ("revolute", "continuous", "prismatic")}
-        articulation, terms = articulate(links, properties, math.hypot(*_GRAVITY), dtype, device)
+        articulation, terms = articulate(links, properties, dtype, device)
         driven = [name for name in articulation.joint_names if name in properties]
-        actuators = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
+        motors = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
+    actuators = Actuators.from_list(articulation, motors) if motors else None
     collisions = urdf_collisions(file, articulation, standing, excluded)
     return Robot(
         name=file.name,
         articulation=articulation,
-        joint_terms=terms,
-        actuators=Actuators.from_list(articulation, actuators) if actuators else None,
+        joint_terms=(*terms, *joint_limits(articulation, actuators, math.hypot(*_GRAVITY))),
+        actuators=actuators,
         colliders=collisions.colliders,
         obstacles=collisions.obstacles,
         excluded=collisions.excluded,

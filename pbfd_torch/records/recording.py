@@ -16,6 +16,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.load import Hazardous
 from pbfd_torch.tree.kinematics import Placement, place
 
 
@@ -66,7 +67,7 @@ class Records:
     def finish(self, lanes: int | None = None) -> Rollout:
         """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
         stacked = {name: torch.stack(_alike(values)) for name, values in self._entries.items()}
-        like = stacked["q"]
+        like, a = stacked["q"], self._scene.articulation
         if "contact_depth" not in stacked:
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
             stacked |= dict.fromkeys(_CONTACT, empty[..., None].expand(*empty.shape, 3)) | {"contact_depth": empty}
@@ -76,6 +77,7 @@ class Records:
             dt=self._dt,
             link_names=self._scene.articulation.link_names,
             joint_names=self._scene.articulation.joint_names,
+            dangers=tuple(x for term in self._scene.terms if isinstance(term, Hazardous) for x in term.dangers(a)),
             lanes=torch.tensor(self._lanes if lanes is None else lanes),
             appearance=depicted(self._scene),
             time=time,
@@ -116,7 +118,7 @@ class Recorder(Records):
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
         """One solved step: the state after it, how it was solved, and its contacts."""
         placement = place(self._scene.articulation, state.q)
-        entries = self._state(state, placement) | {"hazards": state.hazards}
+        entries = self._state(state, placement) | {"hazards": state.hazards, "suspect": self._suspect(state, objective, placement)}
         pairs = zip(objective.terms, objective.prepared, strict=True)
         contacts = [(term, prepared) for term, prepared in pairs if isinstance(term, Contact | BodyContact)]
         points = [term.points(prepared, placement) for term, prepared in contacts]
@@ -125,6 +127,22 @@ class Recorder(Records):
             for name in _CONTACT:
                 entries[name] = torch.cat([getattr(x, name.removeprefix("contact_")) for x in points], -2)
         self._add(solution, entries)
+
+    def _suspect(self, state: State, objective: BalanceObjective, placement: Placement) -> Tensor:
+        """Of the worlds whose step has a hazard what is deepest beyond its measure, `[*batch]`; see `Rollout`."""
+        none = torch.full_like(state.hazards, -1)
+        shares, numbers, count = [], [], 0
+        for term, prepared in zip(objective.terms, objective.prepared, strict=True):
+            if isinstance(term, Hazardous):
+                share, number = term.strain(prepared, placement)
+                shares.append(share)
+                numbers.append(number + count)
+                count += len(term.dangers(objective.articulation))
+        if count == 0:
+            return none
+        worst = torch.cat(shares, -1).argmax(-1, keepdim=True)
+        found = torch.cat(numbers, -1).gather(-1, worst).squeeze(-1)
+        return torch.where(state.hazards != 0, found.to(none.dtype), none)
 
 
 _CONTACT = ("contact_point", "contact_normal", "contact_force", "contact_slip")

@@ -22,7 +22,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.looks.appearance import Appearance, packed, unpacked
 from pbfd_torch.solvers.objective import FALLBACKS, is_solved
 
-FORMAT = "pbfd_torch rollout 5"
+FORMAT = "pbfd_torch rollout 6"
 LARGEST = 2**35  # [bytes] of all arrays of a file together: what claims more is refused rather than read
 
 
@@ -32,6 +32,7 @@ class Rollout:
 
     Attributes:
         scene_name, dt, link_names, joint_names: what was simulated, and the step [s].
+        dangers: names of the pairs that can touch and of the limits, for `suspect`.
         appearance: what bodies and obstacles look like.
         time: `[T + 1]` [s].
         q: `[T + 1, *batch, nq]`.
@@ -47,6 +48,7 @@ class Rollout:
         status: `[T, *batch]` values of `Status`; iterations, evaluations: int; residual_norm: ‖r/scale‖₂.
         fallbacks: `[T, *batch, 4]` int, how often each of `FALLBACKS` was tried.
         hazards: `[T, *batch]` int, `Hazard` bits: what may be wrong with a step although it was solved.
+        suspect: `[T, *batch]` int, where a step has a hazard, which of `dangers` is deepest beyond its measure; −1: none.
         substeps: `[T, *batch]` int, steps that each world has made in it; 1 unless worlds choose their steps themselves.
         lanes: `[]` int, evaluations that the schedule spent on all worlds together, idle ones included.
         contact_point: `[T, *batch, npoint, 3]`; contact_depth: `[T, *batch, npoint]` > 0 inside; contact_normal, contact_force (on
@@ -57,6 +59,7 @@ class Rollout:
     dt: float
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
+    dangers: tuple[str, ...]
     appearance: Appearance
     time: Tensor
     q: Tensor
@@ -74,6 +77,7 @@ class Rollout:
     residual_norm: Tensor
     fallbacks: Tensor
     hazards: Tensor
+    suspect: Tensor
     substeps: Tensor
     lanes: Tensor
     contact_point: Tensor
@@ -98,6 +102,13 @@ class Rollout:
             return self.contact_depth.new_zeros(self.contact_depth.shape[:-1])
         return self.contact_depth.amax(-1).clamp_min(0)
 
+    def hazardous(self, count: int = 5) -> dict[str, int]:
+        """The pairs and limits that most steps with a hazard point to, most of them first, and how many steps of how many worlds
+        that are together."""
+        found = torch.bincount(self.suspect[self.suspect >= 0].flatten().long(), minlength=len(self.dangers))
+        order = found.argsort(descending=True, stable=True)[:count].tolist()
+        return {self.dangers[k]: int(found[k]) for k in order if found[k] > 0}
+
     @property
     def utilisation(self) -> float:
         """Share of the evaluations spent that went to worlds which needed them (Fig. 3)."""
@@ -114,7 +125,7 @@ class Rollout:
         target = Path(path)
         words, surfaces = packed(self.appearance)
         meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt, "appearance": words}
-        meta |= {"link_names": list(self.link_names), "joint_names": list(self.joint_names)}
+        meta |= {name: list(getattr(self, name)) for name in _NAMES}
         arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS} | surfaces
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -142,7 +153,7 @@ class Rollout:
                 if meta.get("format") != FORMAT:
                     raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
                 fields: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
-                fields |= {name: tuple(map(str, meta[name])) for name in ("link_names", "joint_names")}
+                fields |= {name: tuple(map(str, meta[name])) for name in _NAMES}
                 surfaces = {name: file[name] for name in ("visual_vertices", "visual_faces")}
             links = len(fields["link_names"])
             seen = unpacked(meta["appearance"], surfaces, links, links + fields["obstacle_poses"].shape[-3])
@@ -169,7 +180,7 @@ class Rollout:
         }
         states |= {"linear_momentum": (3,), "angular_momentum": (3,), "kinetic_energy": (), "potential_energy": ()}
         solves: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("status", "iterations", "evaluations", "residual_norm", "hazards", "substeps"), ()
+            ("status", "iterations", "evaluations", "residual_norm", "hazards", "suspect", "substeps"), ()
         )
         solves |= {"fallbacks": (len(FALLBACKS),), "contact_depth": slots}
         solves |= {f"contact_{what}": (*slots, 3) for what in ("point", "normal", "force", "slip")}
@@ -183,6 +194,8 @@ class Rollout:
                 raise InputError(f"{name} has shape {tuple(value.shape)}: must be {tuple(shape)}")
             if value.is_floating_point() == (name in _COUNTS):
                 raise InputError(f"{name} is {value.dtype}: must be {'integers' if name in _COUNTS else 'floating-point numbers'}")
+        if bool(((self.suspect < -1) | (self.suspect >= len(self.dangers))).any()):
+            raise InputError(f"suspect holds {self.suspect.unique().tolist()}: must be from -1 to {len(self.dangers) - 1}")
 
 
 # what numpy and zipfile raise on damaged files, and what a foreign `meta` leads to
@@ -191,4 +204,5 @@ _UNREADABLE = (
     zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
 )  # fmt: skip
 _ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]
-_COUNTS = {"status", "iterations", "evaluations", "fallbacks", "hazards", "substeps", "lanes"}
+_COUNTS = {"status", "iterations", "evaluations", "fallbacks", "hazards", "suspect", "substeps", "lanes"}
+_NAMES = ("link_names", "joint_names", "dangers")

@@ -141,6 +141,32 @@ class Actuators:
             share=worlds.pick(self.share, 1),
         )
 
+    def largest(self, articulation: Articulation) -> Tensor:
+        """The largest force [N] or torque [N m] that each actuator puts on its joint `[*, nu]`, its damping left out: what its
+        force range allows, and its control range and its joint's limits; infinite where nothing bounds it."""
+
+        def size(bounds: Tensor) -> Tensor:
+            return bounds.abs().amax(-1)
+
+        def most(factor: Tensor, bound: Tensor) -> Tensor:
+            return torch.where(factor == 0, 0.0, factor.abs() * bound)  # 0 times infinity is nothing here
+
+        limits = torch.stack((articulation.lower, articulation.upper), -1)[..., self.dof, :]
+        asked = most(self.gain, size(self.control_range)) + self.bias.abs() + most(self.stiffness * self.gear, size(limits))
+        return self.gear.abs() * torch.minimum(asked, size(self.force_range))
+
+    def efforts(self, articulation: Articulation) -> list[float]:
+        """The largest force [N] or torque [N m] of all actuators at each degree of freedom, in any world."""
+        each = self.largest(articulation).detach().reshape(-1, self.nu).amax(0)
+        spread = _spread(self.dof, articulation, torch.float64)
+        return torch.where(spread > 0, each[:, None].to(spread), 0.0).sum(0).tolist()
+
+    def pressing(self, prepared: PreparedActuators) -> Tensor:
+        """The size of the force [N] or torque [N m] at each degree of freedom where the step begins, its damping left out,
+        `[*batch, nv]`."""
+        force = _clamped(prepared.drive - self.stiffness * prepared.previous, self.force_range)
+        return ((self.gear * force)[..., None, :] @ prepared.spread).squeeze(-2).abs()
+
     def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
         """∂r/∂q of all joints within the force ranges `[*, nv]`."""
         of_each = self.gear * self.gear * (self.stiffness + self.damping / dt[..., None])

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.contact.candidates import Finder, Slots
-from pbfd_torch.contact.hazards import Hazard, Overflow
+from pbfd_torch.contact.hazards import Hazard, Overflow, marked
 from pbfd_torch.contact.obstacle import Carrier
 from pbfd_torch.contact.surface import Placed
 from pbfd_torch.errors import ContactOverflowError
@@ -110,6 +110,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             lambda: self._gaps(slots, ahead),
             lambda: self._gaps(slots, torch.cat((step.coasting_poses, obstacles), -3)),
         )
+        firm = None if self.firm is None else _of_pairs(self.firm, slots.pair)
         return PreparedBodyContact(
             slots=slots,
             bodies=bodies,
@@ -119,7 +120,9 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             turned=turned,
             anchor=_inherited(memory, slots) if self._anchors else None,
             dt=dt,
-            grip=self.grip[slots.pair],
+            grip=self._gripping(self.grip[slots.pair], firm),
+            firm=firm,
+            deep=None if self.deep is None else _of_pairs(self.deep, slots.pair),
             depth=depth,
             bounce=bounce,
         )
@@ -158,13 +161,27 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         turn = torch.linalg.matrix_norm((after - before)[..., :3, :3]) / 2**0.5  # the chord of a unit arm
         return shift + self.extent * turn
 
-    def hazards(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
-        """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
+    def depths(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
+        """See `ContactLaws`."""
+        return torch.where(prepared.slots.filled, -self._gaps(prepared.slots, prepared.standing(placement)), -_FAR)
+
+    def carried(self, prepared: PreparedBodyContact, links: Tensor) -> Tensor:
+        """See `ContactLaws`."""
+        still = links.new_zeros((*links.shape[:-1], len(self.obstacles)))
+        bodies = torch.cat((links, still), -1)
+        return _of_pairs(bodies, prepared.slots.first) | _of_pairs(bodies, prepared.slots.second)
+
+    def numbers(self, prepared: PreparedBodyContact) -> Tensor:
+        """See `ContactLaws`."""
+        return prepared.slots.pair
+
+    def hazards(self, prepared: PreparedBodyContact, placement: Placement, turned: Tensor) -> Tensor:
+        """See `Hazardous`."""
         far = (self._travel(prepared.bodies, prepared.standing(placement)) > prepared.reach).any(-1)
         slots = prepared.slots
         overlapped = (slots.filled & (self._gaps(slots, prepared.bodies) < -self.slack)).any(-1)
         found = {Hazard.CANDIDATES_DROPPED: slots.dropped, Hazard.MOVED_TOO_FAR: far, Hazard.OVERLAPPED: overlapped}
-        return torch.stack([where.to(torch.int32) * int(bit) for bit, where in found.items()]).sum(0, dtype=torch.int32)
+        return super().hazards(prepared, placement, turned) | marked(found)
 
     def remembered(self, prepared: PreparedBodyContact, placement: Placement) -> Tensor:
         """What the anchors know after a step that ended at a placement; see `memory`."""
@@ -221,6 +238,11 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         moment = summed(on_second - on_first, outer(contact.force, extended(contact.at.points)))
         outlook = functools.partial(_outlook, slots, len(self.obstacles), contact)
         return LinkLoad(moment, stiffness, coupling, outlook)
+
+
+def _of_pairs(values: Tensor, pair: Tensor) -> Tensor:
+    """`[*, npair], [*batch, n] → [*batch, n]`."""
+    return values.expand(*pair.shape[:-1], values.shape[-1]).take_along_dim(pair, -1)
 
 
 def of_slots(bodies: Tensor, index: Tensor) -> Tensor:

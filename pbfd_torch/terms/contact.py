@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Carrier, Obstacle
+from pbfd_torch.contact.polytope import half_thickness
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.contact.surface import Field, Surface, Tangent
 from pbfd_torch.errors import InputError
@@ -26,6 +27,7 @@ from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, turned
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
+from pbfd_torch.terms.firmness import deepest
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.grouping import Grouping
 from pbfd_torch.terms.inertia import inertia_stiffness
@@ -60,7 +62,6 @@ class Contact(ContactLaws[PreparedContact]):
         carrier: where that frame is; None: the world's.
         grip: what the friction law is multiplied by, `[*, npoint]`: the μ of every candidate for a law whose own is 1; None: 1.
         thickness: of a convex solid [m]; candidates that may come past its middle in one step meet its tangent plane instead.
-        names: the collider that each candidate belongs to.
     """
 
     link: Tensor
@@ -71,7 +72,6 @@ class Contact(ContactLaws[PreparedContact]):
     carrier: Carrier | None
     grip: Tensor | None = None
     thickness: float = math.inf
-    names: tuple[str, ...] = ()
 
     @staticmethod
     def between(
@@ -86,7 +86,8 @@ class Contact(ContactLaws[PreparedContact]):
         `InputError` for an unknown link or no candidate at all."""
         links: list[int] = []
         centers, radii, margins = [], [], []
-        names: list[str] = []
+        pairs: list[tuple[str, str]] = []
+        halves: list[float] = []
         for collider in colliders:
             points, radius = collider.shape.candidates()
             turn = quaternion_matrix(torch.tensor(collider.quaternion, dtype=torch.float64)).numpy()
@@ -94,10 +95,12 @@ class Contact(ContactLaws[PreparedContact]):
             centers.append(points @ turn.T + np.array(collider.position))
             radii.append(radius)
             margins.append(np.full(len(points), collider.margin))
-            names += [collider.name] * len(points)
+            pairs += [(collider.name, obstacle.name)] * len(points)
+            halves += [min(half_thickness(collider.shape), 0.5 * obstacle.thickness)] * len(points)
         if not links:
             raise InputError(f"no collider can touch '{obstacle.name}': give at least one")
 
+        law = default_stiffness(articulation) if normal_force is None else normal_force
         reach = float((np.concatenate(radii) + np.concatenate(margins)).max())
 
         def tensor(values: Any) -> Tensor:
@@ -110,11 +113,12 @@ class Contact(ContactLaws[PreparedContact]):
             margin=tensor(np.concatenate(margins)),
             surface=obstacle.surface(articulation.dtype, articulation.device, reach),
             carrier=obstacle.carrier(articulation.dtype, articulation.device),
-            normal_force=default_stiffness(articulation) if normal_force is None else normal_force,
+            normal_force=law,
             friction=friction,
             restitution=restitution,
+            deep=deepest(halves, articulation, law),
+            pairs=tuple(pairs),
             thickness=obstacle.thickness,
-            names=tuple(names),
         )
 
     def __post_init__(self) -> None:
@@ -186,7 +190,32 @@ class Contact(ContactLaws[PreparedContact]):
             lambda: gap(free(), step.target_poses[..., :3, :3]),
             lambda: gap(self._centers(step.coasting_poses), step.coasting_poses[..., :3, :3]),
         )
-        return PreparedContact(centers, rotations, frame, anchor, surface, dt=dt, grip=self.grip, depth=depth, bounce=bounce)
+        return PreparedContact(
+            centers,
+            rotations,
+            frame,
+            anchor,
+            surface,
+            dt=dt,
+            grip=self._gripping(self.grip, self.firm),
+            firm=self.firm,
+            deep=self.deep,
+            depth=depth,
+            bounce=bounce,
+        )
+
+    def depths(self, prepared: PreparedContact, placement: Placement) -> Tensor:
+        """See `ContactLaws`."""
+        field = prepared.surface.field(seen(prepared.frame, self._centers(placement.poses)))
+        return self._depth(field, prepared.frame, placement.poses[..., :3, :3])
+
+    def carried(self, prepared: PreparedContact, links: Tensor) -> Tensor:
+        """See `ContactLaws`."""
+        return links[..., self.link]
+
+    def numbers(self, prepared: PreparedContact) -> Tensor:
+        """See `ContactLaws`."""
+        return torch.arange(len(self.link), device=self.link.device)
 
     def remembered(self, prepared: PreparedContact, placement: Placement) -> Tensor:
         """What the anchors are behind by after a step that ended at a placement; shapes as in `memory`."""
@@ -274,7 +303,12 @@ class Contact(ContactLaws[PreparedContact]):
 
     def potential(self, placement: Placement, time: Tensor) -> Tensor:
         """Energy stored by the normal force [J] `[*batch]` (Eq. 9)."""
-        return self.normal_force.energy(self.depth(placement, time)).sum(-1)
+        return self._firmed.energy(self.depth(placement, time)).sum(-1)
+
+    @property
+    def _firmed(self) -> NormalForce:
+        law = self.normal_force
+        return law if self.firm is None else replaced(law, stiffness=law.stiffness * self.firm)
 
 
 def seen(frame: Tensor | None, points: Tensor) -> Tensor:

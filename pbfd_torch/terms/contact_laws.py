@@ -8,16 +8,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, Self, TypeVar
 
+import torch
 from torch import Tensor
 
+from pbfd_torch.contact.hazards import Hazard, marked
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
-from pbfd_torch.terms.friction_law import FrictionLaw
-from pbfd_torch.terms.lagged_friction import lagged_law, widened_law
+from pbfd_torch.terms.friction_law import ByDepth, FrictionLaw
+from pbfd_torch.terms.lagged_friction import lagged_law, unlagged, widened_law
 from pbfd_torch.terms.load import StepContext
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.touching import ContactForce, Touching
+from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement
 
 
@@ -25,11 +28,14 @@ from pbfd_torch.tree.kinematics import Placement
 class Prepared:
     """What the laws need to know of a step.
 
-    Attributes: `dt` `[*batch, 1]` [s]; `grip` `[*, n]`, see `ContactForce`; `depth` `[*batch, n]` [m] at the start of the step,
+    Attributes: `dt` `[*batch, 1]` [s]; `grip` `[*, n]`, see `ContactForce`; `firm` `[*, n]`: what C⊥ is multiplied by; None: 1;
+    `deep` `[*, n]` [m]: from which depth on it is a hazard; None: none is; `depth` `[*batch, n]` [m] at the start of the step,
     where the normal force lets go; `bounce` `[*batch, n]` [m]: how far the solids are moved out to throw a candidate back."""
 
     dt: Tensor
     grip: Tensor | None
+    firm: Tensor | None = None
+    deep: Tensor | None = None
     depth: Tensor | None = None
     bounce: Tensor | None = None
 
@@ -63,11 +69,17 @@ class ContactLaws(ABC, Generic[P]):
         normal_force: Eq. 8.
         friction: the tangential law, or None for frictionless contacts.
         restitution: how much of the speed of an impact comes back; None: nothing.
+        firm: what C⊥ is multiplied by, `[*, n]` for as many candidates or pairs as `grip` has; None: 1.
+        deep: from which depth on [m] it is a hazard, likewise; None: none is.
+        pairs: names of the two that touch, of every candidate or pair.
     """
 
     normal_force: NormalForce
     friction: FrictionLaw | None
     restitution: Restitution | None = None
+    firm: Tensor | None = None
+    deep: Tensor | None = None
+    pairs: tuple[tuple[str, str], ...] = ()
 
     @abstractmethod
     def memory(self, batch: tuple[int, ...]) -> Tensor:
@@ -81,6 +93,37 @@ class ContactLaws(ABC, Generic[P]):
     def touching(self, prepared: P, placement: Placement) -> Touching:
         """Where the candidates are at a placement that ends the prepared step."""
 
+    @abstractmethod
+    def depths(self, prepared: P, placement: Placement) -> Tensor:
+        """How deep the candidates are at a placement that ends the prepared step, < 0 where apart, `[*batch, n]` [m]."""
+
+    @abstractmethod
+    def carried(self, prepared: P, links: Tensor) -> Tensor:
+        """Which candidates belong to some of the links, `[*batch, nlink]` → `[*batch, n]`, both bool."""
+
+    def hazards(self, prepared: P, placement: Placement, turned: Tensor) -> Tensor:
+        """See `Hazardous`."""
+        depth = self.depths(prepared, placement)
+        far = (depth > 0) & self.carried(prepared, turned)
+        found = {Hazard.TURNED_FAR: far.any(-1)}
+        if prepared.deep is not None:
+            found[Hazard.TOO_DEEP] = (depth > prepared.deep).any(-1)
+        return marked(found)
+
+    def dangers(self, articulation: Articulation) -> tuple[str, ...]:
+        """See `Hazardous`."""
+        return tuple(" – ".join(pair) for pair in self.pairs)
+
+    @abstractmethod
+    def numbers(self, prepared: P) -> Tensor:
+        """The place of each candidate among `pairs`, `[*batch, n]` or `[n]`."""
+
+    def strain(self, prepared: P, placement: Placement) -> tuple[Tensor, Tensor]:
+        """See `Hazardous`."""
+        depth = self.depths(prepared, placement)
+        share = torch.zeros_like(depth) if prepared.deep is None else depth / prepared.deep
+        return share, self.numbers(prepared).expand(depth.shape)
+
     def prepare(self, step: StepContext) -> P:
         """See `Term`."""
         return self.recall(step, self.memory(step.target_q.shape[:-1]))
@@ -89,6 +132,12 @@ class ContactLaws(ABC, Generic[P]):
     def _anchors(self) -> AnchoredFriction | None:
         """The friction, if it remembers where contacts stuck."""
         return self.friction if isinstance(self.friction, AnchoredFriction) else None
+
+    def _gripping(self, grip: Tensor | None, firm: Tensor | None) -> Tensor | None:
+        """What the friction law is multiplied by: a law that goes by the depth is made as firm as the normal force, `[*, n]`."""
+        if firm is None or not isinstance(unlagged(self.friction), ByDepth):
+            return grip
+        return firm if grip is None else firm * grip
 
     def _beginning(
         self, dt: Tensor, start: Callable[[], Tensor], free: Callable[[], Tensor], coasting: Callable[[], Tensor]
@@ -105,13 +154,17 @@ class ContactLaws(ABC, Generic[P]):
     def take(self, worlds: Worlds) -> Self:
         """The same contact of some worlds."""
         friction = None if self.friction is None else self.friction.take(worlds)
-        return replaced(self, normal_force=self.normal_force.take(worlds), friction=friction)
+        firm, deep = worlds.pick(self.firm, 1), worlds.pick(self.deep, 1)
+        return replaced(self, normal_force=self.normal_force.take(worlds), friction=friction, firm=firm, deep=deep)
 
     def pressing(self, prepared: P) -> NormalForce:
         """The normal force of every candidate in the prepared step."""
+        law = self.normal_force
+        if prepared.firm is not None:
+            law = replaced(law, stiffness=law.stiffness * prepared.firm)
         if self.restitution is None or prepared.bounce is None:
-            return self.normal_force
-        return self.restitution.stiffened(self.normal_force, prepared.bounce)
+            return law
+        return self.restitution.stiffened(law, prepared.bounce)
 
     def force(self, prepared: P, placement: Placement) -> ContactForce:
         """The forces on the candidates at a placement that ends the prepared step."""

@@ -29,11 +29,13 @@ from pbfd_torch.contact.round_pairs import Round, RoundPairs
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Curved, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
+from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_body_contact import CurvedBodyContact
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.firmness import Meeting, Side, deepest, firmness, side_of
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
@@ -49,13 +51,14 @@ class ContactRules:
     """How contacts of a scene behave.
 
     Attributes:
-        normal_force: Eq. 8; None: that of `default_stiffness`.
+        normal_force: Eq. 8; None: every pair is as firm as it needs to be (`firmness`).
         friction: the law for μ = 1; every pair has its own μ (`friction_between`); None: there is no friction anywhere.
         restitution: None: impacts are inelastic.
         excluded: pairs of names of links and obstacles that do not touch.
         between_links: whether links touch each other at all.
         slots: how many candidates of each kind a world keeps, ≥ 1; None: 128, or fewer where no more can be.
         overflow: what to do where more is near.
+        actuators: what presses colliders together besides the weight.
     """
 
     normal_force: NormalForce | None = None
@@ -65,6 +68,7 @@ class ContactRules:
     between_links: bool = True
     slots: int | None = None
     overflow: Overflow = Overflow.FLAG
+    actuators: Actuators | None = None
 
     def __post_init__(self) -> None:
         if self.slots is not None and self.slots < 1:
@@ -128,16 +132,41 @@ class _Builder:
         """Contacts of candidate points with one obstacle each."""
         terms: list[Term] = []
         for obstacle in self.obstacles:
-            near = [c for k, c in enumerate(self.colliders) if self._touches(k, obstacle)]
-            by_points = [c for c in near if _by_points(c, obstacle)]
+            near = [k for k, c in enumerate(self.colliders) if self._touches(k, obstacle) and _by_points(c, obstacle)]
             for kind, curved in ((CurvedContact, True), (Contact, False)):
-                if touching := [c for c in by_points if isinstance(c.shape, Curved) is curved]:
+                if ks := [k for k in near if isinstance(self.colliders[k].shape, Curved) is curved]:
+                    touching = [self.colliders[k] for k in ks]
                     contact = kind.between(
                         self.articulation, touching, obstacle, self.normal_force, self.rules.friction, self.rules.restitution
                     )
                     mu = [friction_between(c, obstacle) for c in touching for _ in range(_candidates(c))]
-                    terms.append(dataclasses.replace(contact, grip=self._tensor(mu)))
+                    pairs = [(k, obstacle) for k in ks for _ in range(_candidates(self.colliders[k]))]
+                    firm, deep = self._firm(pairs)
+                    terms.append(dataclasses.replace(contact, grip=self._tensor(mu), firm=firm, deep=deep))
         return terms
+
+    def _firm(self, pairs: Sequence[tuple[int, int | HalfSpace | Obstacle]]) -> tuple[Tensor | None, Tensor]:
+        """`firm` and `deep` of pairs of a collider and another one, or an obstacle."""
+        meetings = [self._meeting(k, other) for k, other in pairs]
+        if self.rules.normal_force is not None:
+            return None, deepest([x.half for x in meetings], self.articulation, self.normal_force)
+        firm = firmness(meetings, self.articulation, self.normal_force)
+        return firm, self._tensor([x.deepest for x in meetings])
+
+    def _meeting(self, k: int, other: int | HalfSpace | Obstacle) -> Meeting:
+        one = self._sides[k]
+        strongest = max((x.force for x in self._sides if x.held), default=0.0)
+        if isinstance(other, int):
+            both = self._sides[other]
+            between = max(one.force, both.force)
+            return Meeting(min(one.half, both.half), one.ball or both.ball, max(between, strongest), between)
+        return Meeting(min(one.half, 0.5 * other.thickness), one.ball, strongest, one.force)
+
+    @cached_property
+    def _sides(self) -> Sequence[Side]:
+        a, actuators = self.articulation, self.rules.actuators
+        efforts = [0.0] * a.nv if actuators is None else actuators.efforts(a)
+        return [side_of(a, efforts, a.link_index(c.link), c.shape, float(_extent(self._part(c)))) for c in self.colliders]
 
     def _touches(self, k: int, obstacle: HalfSpace | Obstacle) -> bool:
         """Whether a collider may meet an obstacle."""
@@ -159,6 +188,9 @@ class _Builder:
         parts += [_Part(links + k, shape, torch.eye(4, dtype=torch.float64)) for k, shape in enumerate(shapes)]
         pairs = [*self._link_pairs(), *self._obstacle_pairs(solids)]
         mu = self._tensor([friction_between(self._touchable(a, solids), self._touchable(b, solids)) for a, b in pairs])
+        count = len(self.colliders)
+        firm = self._firm([(a, b if b < count else solids[b - count]) for a, b in pairs]) if pairs else (None, None)
+        names = tuple((self.colliders[a].name, self._touchable(b, solids).name) for a, b in pairs)
         extent = torch.zeros(links + len(solids), dtype=torch.float64)
         for part in parts:
             extent[part.body] = torch.maximum(extent[part.body], _extent(part))
@@ -169,6 +201,9 @@ class _Builder:
                 obstacles=carriers,
                 extent=extent.to(mu),
                 grip=mu,
+                pairs=names,
+                firm=firm[0],
+                deep=firm[1],
                 overflow=self.rules.overflow,
                 normal_force=self.normal_force,
                 friction=self.rules.friction,

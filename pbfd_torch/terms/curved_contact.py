@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.polytope import half_thickness
 from pbfd_torch.contact.shapes import Collider, Curved
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
@@ -24,6 +25,7 @@ from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.vectors import applied, turned
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact import Contact, PreparedContact, seen
+from pbfd_torch.terms.firmness import deepest
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.load import StepContext
 from pbfd_torch.terms.lying import share_of
@@ -81,6 +83,9 @@ class CurvedContact(Contact):
         margin = tensor([np.full(n, c.margin) for c, n in zip(colliders, each, strict=True)])
         places = zip(supports, turns, colliders, strict=True)
         reach = max(float(np.sqrt(x.forms.max())) + c.margin for x, c in zip(supports, colliders, strict=True))
+        law = default_stiffness(articulation) if normal_force is None else normal_force
+        thin = 0.5 * obstacle.thickness
+        halves = [min(half_thickness(c.shape), thin) for c, n in zip(colliders, each, strict=True) for _ in range(n)]
         return CurvedContact(
             link=indices(links, articulation.device),
             position=tensor([x.centers @ turn.T + np.array(c.position) for x, turn, c in places]),
@@ -88,11 +93,12 @@ class CurvedContact(Contact):
             margin=margin,
             surface=obstacle.surface(articulation.dtype, articulation.device, reach),
             carrier=obstacle.carrier(articulation.dtype, articulation.device),
-            normal_force=default_stiffness(articulation) if normal_force is None else normal_force,
+            normal_force=law,
             friction=friction,
             restitution=restitution,
             thickness=obstacle.thickness,
-            names=tuple(c.name for c, n in zip(colliders, each, strict=True) for _ in range(n)),
+            deep=deepest(halves, articulation, law),
+            pairs=tuple((c.name, obstacle.name) for c, n in zip(colliders, each, strict=True) for _ in range(n)),
             form=tensor([turn @ x.forms @ turn.T for x, turn in zip(supports, turns, strict=True)]),
             axis=tensor([x.axes @ turn.T for x, turn in zip(supports, turns, strict=True)]),
             lying=torch.as_tensor(np.concatenate([x.lying for x in supports]), device=articulation.device),
@@ -139,7 +145,8 @@ class CurvedContact(Contact):
         """See `Contact`."""
         centers, frame, rotations = self._centers(placement.poses), self._frame(time), placement.poses[..., :3, :3]
         field = self.surface.field(seen(frame, centers))
-        law = replaced(self.normal_force, stiffness=self.normal_force.stiffness * self._share(field, frame, rotations))
+        law = self._firmed
+        law = replaced(law, stiffness=law.stiffness * self._share(field, frame, rotations))
         return law.energy(self._depth(field, frame, rotations)).sum(-1)
 
 

@@ -42,6 +42,16 @@ class SlipLaw(FrictionLaw, Protocol):
 
 
 @runtime_checkable
+class ByDepth(Protocol):
+    """A law that goes by the depth, with a stiffness of its own, and not by the normal force."""
+
+    @property
+    def stiffness(self) -> float | Tensor:
+        """C∥."""
+        ...
+
+
+@runtime_checkable
 class Lifting(Protocol):
     """A law that pushes along the normal as well, by a force f* that depends on the slip."""
 

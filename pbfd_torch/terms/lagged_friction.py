@@ -45,8 +45,13 @@ class LaggedFriction:
 
 def lagged_law(law: FrictionLaw | None, normal: Tensor, depth: Tensor) -> FrictionLaw | None:
     """The law held at normal forces and depths `[*batch, npoint]` where it is a `SlipLaw` or held already; else the law itself."""
-    inner = law.law if isinstance(law, LaggedFriction) else law
+    inner = unlagged(law)
     return LaggedFriction(inner, normal, depth) if isinstance(inner, SlipLaw) else law
+
+
+def unlagged(law: FrictionLaw | None) -> FrictionLaw | None:
+    """The law that is held, or itself."""
+    return law.law if isinstance(law, LaggedFriction) else law
 
 
 def widened_law(law: FrictionLaw | None, factor: float) -> FrictionLaw | None:

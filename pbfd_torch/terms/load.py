@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Chord, Motion, Placement, place
 
 
@@ -217,10 +218,20 @@ class Aftermath:
 
 @runtime_checkable
 class Hazardous(Protocol):
-    """A term that can tell when it may have missed something."""
+    """A term that can tell what may be wrong with a step although it was solved."""
 
-    def hazards(self, prepared: Any, placement: Placement) -> Tensor:
-        """`Hazard` bits of a step that ended at a placement, `[*batch]` int."""
+    def hazards(self, prepared: Any, placement: Placement, turned: Tensor) -> Tensor:
+        """`Hazard` bits of a step that ended at a placement, `[*batch]` int; turned: `[*batch, nlink]` bool, the links that have
+        turned far in it."""
+        ...
+
+    def dangers(self, articulation: Articulation) -> tuple[str, ...]:
+        """Names of what may be in danger."""
+        ...
+
+    def strain(self, prepared: Any, placement: Placement) -> tuple[Tensor, Tensor]:
+        """How deep everything is at a placement that ends the prepared step, as a share of the depth that is a hazard, and its
+        place among `dangers`, `[*batch, n]` each."""
         ...
 
 
