@@ -20,7 +20,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.schedules.adaptive import AdaptiveStepper
 from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.eager import MOST_EVALUATIONS, EagerStepper
 from pbfd_torch.stepping.stepper import Solver, Stepper
 from pbfd_torch.tree.articulation import Articulation
 
@@ -30,7 +30,8 @@ class Simulator(Generic[S]):
 
     `dt`: step [s] > 0, a number, or a scalar tensor where gradients by it are wanted; smaller than 1e-5 is refused because rounding
     would dominate the positions' differences. `halvings`: how often a world's step may be halved (2, 4, 8 … shorter steps) where
-    nothing else solves it; 0: never. `gradients`: how steps are differentiated (`gradients.implicit`).
+    nothing else solves it; 0: never. `evaluations`: the most that a world may spend on a step, with all that is tried; what is not
+    solved by then is unsolved. `gradients`: how steps are differentiated (`gradients.implicit`).
 
     `stepper` makes the steps. `eager` makes them in PyTorch: it knows their balance, and derivatives retrace them with it."""
 
@@ -42,8 +43,9 @@ class Simulator(Generic[S]):
         solver: Solver | None = None,
         halvings: int = 3,
         gradients: Gradients | None = None,
+        evaluations: int = MOST_EVALUATIONS,
     ) -> None:
-        self.eager: EagerStepper[S] = EagerStepper(scene, dt, integrator, solver, halvings)
+        self.eager: EagerStepper[S] = EagerStepper(scene, dt, integrator, solver, halvings, evaluations)
         self.stepper: Stepper[S] = self.eager
         self.gradients = gradients or Gradients()
 

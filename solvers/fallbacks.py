@@ -33,6 +33,11 @@ class Detour(Protocol):
         """Of a world that it helped."""
         ...
 
+    @property
+    def stages(self) -> int:
+        """How many problems it solves."""
+        ...
+
     def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
         """Solves easier problems in turn, from `start`; the last solution is the better start."""
         ...
@@ -57,6 +62,11 @@ class WarmStart:
     kind: int = 0
     status: Status = Status.WARM_STARTED
 
+    @property
+    def stages(self) -> int:
+        """See `Detour`."""
+        return self.passes
+
     def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
         """See `Detour`."""
         return climbed(solver, self.tolerance, [objective.lagged] * self.passes, start)
@@ -71,6 +81,11 @@ class Continuation:
     tolerance: float = 1e-1
     kind: int = 1
     status: Status = Status.CONTINUED
+
+    @property
+    def stages(self) -> int:
+        """See `Detour`."""
+        return len(self.ladder)
 
     def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
         """See `Detour`."""
@@ -107,24 +122,33 @@ class Fallbacks:
         has a solution, and no detour leads to one."""
         return dataclasses.replace(self.direct, max_evaluations=min(SOON, self.direct.max_evaluations))
 
-    def solve(self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None) -> Solution:
-        """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours."""
+    def solve(
+        self, objective: Relaxable, guess: Tensor, retreat: Tensor | None = None, budget: int | Tensor | None = None
+    ) -> Solution:
+        """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours. budget: as in
+        `rescued`, and enough for the direct way."""
         solution = self.direct.solve(objective, guess, retreat)
-        return self.rescued(objective, solution, guess, guess if retreat is None else retreat)
+        return self.rescued(objective, solution, guess, guess if retreat is None else retreat, budget)
 
-    def rescued(self, objective: Relaxable, solution: Solution, guess: Tensor, start: Tensor) -> Solution:
+    def rescued(
+        self, objective: Relaxable, solution: Solution, guess: Tensor, start: Tensor, budget: int | Tensor | None = None
+    ) -> Solution:
         """The solution of the direct way with its unsolved worlds led along the detours, from `start`; what these leave tries the
-        direct way from `guess` after all, as the retreat from it may have been the mistake. Both starts are `[*batch, nq]`."""
+        direct way from `guess` after all, as the retreat from it may have been the mistake. Both starts are `[*batch, nq]`.
+        budget: evaluations that a world may spend in all, those of the solution included, a number or `[*batch]`; None: any. A way
+        that might take more is not taken."""
         for detour in self.detours:
-            index = solution.unsolved
+            index = solution.within(budget, detour.stages * self.stage.max_evaluations + self.last.max_evaluations)
             if len(index) == 0:
-                return solution
+                continue
             part = objective.take(index)
             climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
             climbs.append(self.last.solve(part, climbs[-1].q))
             solution = merged(solution, index, climbs, detour.kind, detour.status)
-        index = solution.unsolved
-        if len(index) == 0 or guess is start:
+        if guess is start:
+            return solution
+        index = solution.within(budget, self.last.max_evaluations)
+        if len(index) == 0:
             return solution
         again = self.last.solve(objective.take(index), guess.reshape(-1, guess.shape[-1])[index])
         return merged(solution, index, [again], None, Status.SOLVED)

@@ -154,3 +154,11 @@ class Solution:
         """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start. Whoever
         asks first makes the host wait for a device; it is known after that."""
         return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+
+    def within(self, budget: int | Tensor | None, cost: int | Tensor) -> Tensor:
+        """Those of the `unsolved` worlds that may spend as many evaluations more: their budget is a number or `[*batch]`; None: they
+        all may."""
+        index = self.unsolved
+        if budget is None or len(index) == 0:
+            return index
+        return index[((self.evaluations + cost) <= budget).reshape(-1)[index]]

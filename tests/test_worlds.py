@@ -146,6 +146,11 @@ def with_law(s: Situation, stiffness: Tensor) -> Contact:
     return dataclasses.replace(contact(s, CoulombFriction(0.7, 50.0)), normal_force=NormalForce(stiffness))
 
 
+def firm(s: Situation, lead: tuple[int, ...]) -> Contact:
+    """How firm candidates are, and how deep they may be."""
+    return dataclasses.replace(contact(s), firm=spread(2.0, lead, (POINTS,)), deep=spread(1e-3, lead, (POINTS,)))
+
+
 @dataclass(frozen=True)
 class ParameterCase:
     """`build` makes a term whose parameters have the leading dimensions `lead`."""
@@ -160,6 +165,7 @@ class ParameterCase:
 PARAMETERS = (
     ParameterCase("C⊥ per world", lambda s, lead: with_law(s, spread(1e4, lead, (1,)))),
     ParameterCase("C⊥ per candidate", lambda s, lead: with_law(s, spread(1e4, lead, (POINTS,)))),
+    ParameterCase("firmness per candidate", firm),
     ParameterCase("μ per world", lambda s, lead: contact(s, CoulombFriction(spread(0.4, lead, (1,)), 50.0))),
     ParameterCase("μ per candidate", lambda s, lead: contact(s, CoulombFriction(spread(0.4, lead, (POINTS,)), 50.0))),
     ParameterCase("C∥ per candidate", lambda s, lead: contact(s, PbfdFriction.as_printed(spread(5e4, lead, (POINTS,))))),
@@ -267,7 +273,7 @@ def test_only_what_differs_is_copied(friction: Callable[[Tensor], FrictionLaw]) 
     part = made.take(worlds)
     assert part is not made
     assert part.friction is not made.friction
-    for name in ("link", "position", "radius", "margin", "surface", "normal_force", "names"):
+    for name in ("link", "position", "radius", "margin", "surface", "normal_force", "pairs"):
         assert getattr(part, name) is getattr(made, name)
     shared = contact(s, friction(torch.full((POINTS,), 0.5, dtype=torch.float64)))
     assert shared.take(worlds) is shared

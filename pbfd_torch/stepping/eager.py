@@ -18,6 +18,7 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
 from pbfd_torch.scene import Scene
+from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks, merged
 from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
@@ -29,6 +30,7 @@ from pbfd_torch.terms.load import Term
 from pbfd_torch.tree.articulation import Articulation, force_scale
 
 R = TypeVar("R", bound=State)
+MOST_EVALUATIONS, FEWEST_EVALUATIONS = 5000, 200
 Attempt = Callable[["EagerStepper[Any]", Any, Tensor | None], tuple[Any, Tensor]]
 """Makes a step and says where it ended and which worlds `[*batch]` it solved."""
 
@@ -38,8 +40,9 @@ class EagerStepper(Generic[S]):
 
     `scene`, `integrator` (None: `EnergyMomentum`), `solver` (None: `Fallbacks`): what it is made of. `dt`: step [s] ≥ 1e-5, a
     number or a scalar tensor; rounding would dominate the positions' differences of shorter ones. `halvings` ≥ 0: how often a
-    world's step may be halved (2, 4, 8 … shorter steps) where nothing else solves it. Raises `InputError` for a step or halvings
-    out of range.
+    world's step may be halved (2, 4, 8 … shorter steps) where nothing else solves it. `evaluations` ≥ 200: what a world may spend
+    on a step, with all that is tried; the solver's own limit is one of each of its attempts. Raises `InputError` for a step,
+    halvings or evaluations out of range.
 
     `terms`: the scene's as they act in a step. `scale`: `[*batch, nv]`, see `force_scale`."""
 
@@ -50,17 +53,21 @@ class EagerStepper(Generic[S]):
         integrator: Integrator[S] | None = None,
         solver: Solver | None = None,
         halvings: int = 3,
+        evaluations: int = MOST_EVALUATIONS,
     ) -> None:
         step = float(dt.detach()) if isinstance(dt, Tensor) else dt
         if not (math.isfinite(step) and step >= SHORTEST_STEP):
             raise InputError(f"dt is {step} s: must be a finite number ≥ 1e-5")
         if halvings < 0:
             raise InputError(f"halvings is {halvings}: must be ≥ 0")
+        if evaluations < FEWEST_EVALUATIONS:
+            raise InputError(f"evaluations is {evaluations}: must be ≥ {FEWEST_EVALUATIONS}")
         a = scene.articulation
         self.scene = scene
         self.integrator: Integrator[S] = integrator or cast(Integrator[S], EnergyMomentum())
         self.solver: Solver = solver or Fallbacks()
         self.halvings = halvings
+        self.evaluations: int | Tensor = evaluations
         self._dt: float | None = float(step)
         self.step_size = torch.as_tensor(dt, dtype=a.dtype, device=a.device)
         with torch.no_grad():
@@ -95,6 +102,7 @@ class EagerStepper(Generic[S]):
             terms=[term.take(worlds) for term in self.terms],
             scale=worlds.pick(self.scale, 1),
             step_size=worlds.pick(self.step_size, 0),
+            evaluations=worlds.pick(self.evaluations, 0),
         )
 
     def sized(self, step_size: Tensor) -> EagerStepper[S]:
@@ -180,30 +188,42 @@ class EagerStepper(Generic[S]):
             return advanced, solution, Way(solution.q, (), objective)
         easier = self.integrator.easier
         if not easier and isinstance(self.solver, Fallbacks):
-            solution = self.solver.rescued(objective, solution, objective.guess, state.q)
+            solution = self.solver.rescued(objective, solution, objective.guess, state.q, self.evaluations)
             advanced, _ = self.integrator.advance(objective, state, solution.q)  # without an easier step nothing is refused
         q = solution.q
         detours: list[Detour] = []
         if easier and self._may_halve(1):
             index = index[self.integrator.halves(objective, q).reshape(-1)[index]]
-            if len(index):
+            if len(index := self._halvable(solution, index, 2)):
                 advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2)
                 detours.append(detour)
         for k, scheme in enumerate(easier):
-            index = solution.unsolved
-            if len(index) == 0:
-                break
             # detours for the last one only: what comes before is tried for its accuracy
             solver = self.solver if k == len(easier) - 1 else self.first_solver
+            index = solution.within(self.evaluations, _attempt_of(solver))
+            if len(index) == 0:
+                break
             advanced, solution, detour = self._eased(state, control, advanced, solution, index, scheme, solver)
             detours.append(detour)
         for halvings in range(1, self.halvings + 1):
-            index = solution.unsolved
-            if len(index) == 0 or not self._may_halve(halvings):
+            if not self._may_halve(halvings):
+                break
+            index = self._halvable(solution, solution.unsolved, 2**halvings)
+            if len(index) == 0:
                 break
             advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2**halvings)
             detours.append(detour)
         return advanced, solution, Way(q, tuple(detours), objective)
+
+    def _halvable(self, solution: Solution, index: Tensor, parts: int) -> Tensor:
+        """Which of these worlds can afford the first attempt at each of so many shorter steps."""
+        if len(index) == 0:
+            return index
+        spent = (solution.evaluations + parts * _attempt_of(self.first_solver)).reshape(-1)[index]
+        return index[spent <= self._budget(index)]
+
+    def _budget(self, index: Tensor) -> int | Tensor:
+        return self.evaluations.reshape(-1)[index] if isinstance(self.evaluations, Tensor) else self.evaluations
 
     def _may_halve(self, times: int) -> bool:
         return times <= self.halvings and self.dt / 2**times >= SHORTEST_STEP
@@ -225,7 +245,9 @@ class EagerStepper(Generic[S]):
         other = part.with_scheme(easier, solver, 0, part.step_size)
         before, held = state.take(worlds), None if control is None else worlds.pick(control, 1)
         objective = other.objective(before, held)
-        found = other.solver.solve(objective, objective.guess, before.q)
+        left = self._budget(index) - solution.evaluations.reshape(-1)[index]
+        budgeted = {"budget": left} if isinstance(solver, Fallbacks) else {}
+        found = solver.solve(objective, objective.guess, before.q, **budgeted)
         lost = torch.where(solution.solved, solution.residual_norm, math.inf)
         result = merged(
             dataclasses.replace(solution, residual_norm=lost), index, [found], FALLBACKS.index("easier step"), Status.EASED
@@ -241,7 +263,8 @@ class EagerStepper(Generic[S]):
         goes on with the velocity of the last one."""
         worlds = Worlds(state.q.shape[:-1], index)
         part = self.take(worlds)
-        short = part.with_scheme(self.integrator, self.solver, 0, part.step_size / parts)
+        left = (self._budget(index) - solution.evaluations.reshape(-1)[index]) // parts
+        short = part.with_scheme(self.integrator, self.solver, 0, part.step_size / parts).changed(evaluations=left)
         now = self.integrator.resized(short.articulation, state.take(worlds), part.step_size, short.step_size)
         held = None if control is None else worlds.pick(control, 1)
         climbs: list[Solution] = []
@@ -261,6 +284,12 @@ class EagerStepper(Generic[S]):
         climbs[-1] = dataclasses.replace(climbs[-1], status=failed, residual_norm=torch.where(solved, worst, math.inf))
         result = merged(solution, index, climbs, FALLBACKS.index("halving"), Status.HALVED)
         return put(advanced, end, worlds, solved), result, Detour(worlds, solved, self.integrator, tuple(legs))
+
+
+def _attempt_of(solver: Solver) -> int:
+    """Evaluations that the first attempt of a solver may take."""
+    direct = solver.direct if isinstance(solver, Fallbacks) else solver
+    return direct.max_evaluations if isinstance(direct, Descent) else 0
 
 
 def _scale(scene: Scene) -> Tensor:

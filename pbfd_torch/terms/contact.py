@@ -184,8 +184,9 @@ class Contact(ContactLaws[PreparedContact]):
         def gap(points: Tensor, rotations: Tensor) -> Tensor:
             return -self._depth(surface.field(seen(frame, points)), frame, rotations)
 
-        depth, bounce = self._beginning(
+        beginning = self._beginning(
             dt,
+            self.deep,
             lambda: gap(centers, rotations),
             lambda: gap(free(), step.target_poses[..., :3, :3]),
             lambda: gap(self._centers(step.coasting_poses), step.coasting_poses[..., :3, :3]),
@@ -200,8 +201,7 @@ class Contact(ContactLaws[PreparedContact]):
             grip=self._gripping(self.grip, self.firm),
             firm=self.firm,
             deep=self.deep,
-            depth=depth,
-            bounce=bounce,
+            **beginning,
         )
 
     def depths(self, prepared: PreparedContact, placement: Placement) -> Tensor:

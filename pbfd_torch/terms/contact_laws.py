@@ -23,6 +23,8 @@ from pbfd_torch.terms.touching import ContactForce, Touching
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement
 
+SLACK = 0.01  # [m] by which bodies may overlap without a hazard: two that are pressed together, not ones that began so
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prepared:
@@ -30,7 +32,9 @@ class Prepared:
 
     Attributes: `dt` `[*batch, 1]` [s]; `grip` `[*, n]`, see `ContactForce`; `firm` `[*, n]`: what C⊥ is multiplied by; None: 1;
     `deep` `[*, n]` [m]: from which depth on it is a hazard; None: none is; `depth` `[*batch, n]` [m] at the start of the step,
-    where the normal force lets go; `bounce` `[*batch, n]` [m]: how far the solids are moved out to throw a candidate back."""
+    where the normal force lets go; `bounce`, `sunk` `[*batch, n]` [m]: how far the solids are moved out to throw a candidate back,
+    and in where it overlapped by more than any contact should: from there it is let out at the release speed, by a force that is
+    no larger than it needs to be."""
 
     dt: Tensor
     grip: Tensor | None
@@ -38,10 +42,12 @@ class Prepared:
     deep: Tensor | None = None
     depth: Tensor | None = None
     bounce: Tensor | None = None
+    sunk: Tensor | None = None
 
     def raised(self, depth: Tensor) -> Tensor:
         """Depths beside the solids where these are moved to, `[*batch, n]` [m]."""
-        return depth if self.bounce is None else depth + self.bounce
+        depth = depth if self.bounce is None else depth + self.bounce
+        return depth if self.sunk is None else depth - self.sunk
 
 
 P = TypeVar("P", bound=Prepared)
@@ -140,16 +146,26 @@ class ContactLaws(ABC, Generic[P]):
         return firm if grip is None else firm * grip
 
     def _beginning(
-        self, dt: Tensor, start: Callable[[], Tensor], free: Callable[[], Tensor], coasting: Callable[[], Tensor]
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """`depth` and `bounce` of `Prepared`, from the gaps `[*batch, n]` [m] at the start of the step, at the end of its free
-        motion, and at that without any force; they are asked for where they count."""
+        self,
+        dt: Tensor,
+        deep: Tensor | None,
+        start: Callable[[], Tensor],
+        free: Callable[[], Tensor],
+        coasting: Callable[[], Tensor],
+    ) -> dict[str, Tensor | None]:
+        """`depth`, `bounce` and `sunk` of `Prepared`, from the gaps `[*batch, n]` [m] at the start of the step, at the end of its
+        free motion, and at that without any force; they are asked for where they count."""
         lets_go = math.isfinite(self.normal_force.release)
         if self.restitution is None and not lets_go:
-            return None, None
+            return {}
         gap = start()
         bounce = None if self.restitution is None else self.restitution.bounce(gap, free(), dt, coasting())
-        return -gap if lets_go else None, bounce
+        if not lets_go:
+            return {"bounce": bounce}
+        if deep is None:
+            return {"depth": -gap, "bounce": bounce}
+        sunk = (-gap - deep.clamp_min(SLACK)).clamp_min(0)
+        return {"depth": -gap - sunk, "bounce": bounce, "sunk": sunk}
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact of some worlds."""
