@@ -148,7 +148,7 @@ def with_law(s: Situation, stiffness: Tensor) -> Contact:
 
 def firm(s: Situation, lead: tuple[int, ...]) -> Contact:
     """How firm candidates are, and how deep they may be."""
-    return dataclasses.replace(contact(s), firm=spread(2.0, lead, (POINTS,)), deep=spread(1e-3, lead, (POINTS,)))
+    return dataclasses.replace(contact(s, None), firm=spread(2.0, lead, (POINTS,)), deep=spread(1e-3, lead, (POINTS,)))
 
 
 @dataclass(frozen=True)

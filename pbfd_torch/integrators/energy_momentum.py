@@ -44,7 +44,8 @@ from pbfd_torch.tree.kinematics import Chord, Motion, Placement, difference, pla
 
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step
-EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included
+EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
+SURPLUS, RESERVE = 1e-3, 1e-2  # of the largest kinetic energy so far: what steps may gain together, and what is kept of losses
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,6 +58,9 @@ class Velocities(State):
     lag: twice what v is short by besides, `[*batch, nv]`: what forces of another weight take from the loads with θ > ½, 2θ − 1 of
         their impulse.
     average: velocity over that step, `[*batch, nv]`: with it the next step's solution is guessed.
+    surplus: energy [J] `[*batch]` that all steps together have gained beyond the work done on the bodies. What they have lost makes
+        up for it, but for no more than `RESERVE`: what an impact takes is gone.
+    peak: the largest kinetic energy so far [J] `[*batch]`, that of a fall over one step included.
     """
 
     v: Tensor
@@ -64,13 +68,20 @@ class Velocities(State):
     steady: Tensor
     lag: Tensor
     average: Tensor
+    surplus: Tensor
+    peak: Tensor
+
+    @property
+    def overdrawn(self) -> Tensor:
+        """Where more energy has been gained than may be, `[*batch]` bool."""
+        return self.surplus > SURPLUS * self.peak
 
 
 @dataclass(frozen=True)
 class EnergyMomentum:
     """κ = 1/Δt², T̂ = T_n + Δt V_n + ½Δt² [0 | g], share ½. The step is refused where a link has turned so far that the chord knows
     little of its rotation (virtual work vanishes there, and so does the residual, whatever the forces), and where contacts have
-    done more work than they can."""
+    done more work than they can: in it, or in all steps together."""
 
     @property
     def easier(self) -> Sequence[Integrator[Velocities]]:
@@ -90,8 +101,8 @@ class EnergyMomentum:
         """With what contacts, limits and friction give in a trial step, unless that is an impact, which has given nothing
         before."""
         trial, dt = starter.trial(q, v, control), starter.step_size
-        nothing = torch.zeros_like(v)
-        begin = Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v)
+        nothing, zero = torch.zeros_like(v), torch.zeros_like(q[..., 0])
+        begin = Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v, surplus=zero, peak=zero)
         objective = starter.objective(begin, control)
         forces = _Forces(objective, place(starter.articulation, trial.end))
         at = objective.step.previous
@@ -141,39 +152,29 @@ class EnergyMomentum:
         before = Motion(step.previous, state.v).rates
         early = dt[..., None] * (forces.rough + forces.ahead * forces.smooth)
         momentum = _momentum(objective, now, 2 * rates - before, 2 * average - state.v) - early
-        end = _ended(objective, state, now, momentum, forces, average)
+        gain = _Gain(objective, state, _ended(objective, state, now, momentum, forces, average), now, forces)
 
         def refused() -> Tensor:
             flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
             turned = objective.turn(dt[..., None] * average)
-            gained, energy = self._gain(objective, state, end, now, forces)
+            excess, overdrawn = gain.energy > EXCESS * gain.kinetic, gain.end.overdrawn
             # what rounding has left of the residual works too: in float32 stiff friction is off by a share of the weight
-            suspect = gained > EXCESS * energy
+            suspect = excess | overdrawn
             # what is in the host's own memory it may look at; asking a device would make it wait
             if suspect.device.type != "cpu" or bool(suspect.numpy().any()):
-                gained = torch.where(suspect, gained - dt * (objective.evaluate(q).residual * average).sum(-1), gained)
-            return (flat < FLATTEST) | (turned > FARTHEST) | (gained > EXCESS * energy)
+                spurious = dt * (objective.evaluate(q).residual * average).sum(-1)
+                excess = gain.energy - spurious > EXCESS * gain.kinetic
+                overdrawn = replaced(gain.end, surplus=gain.end.surplus - spurious).overdrawn
+            return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn
 
-        return end, refused
+        return gain.end, refused
 
-    def _gain(
-        self, objective: BalanceObjective, state: Velocities, end: Velocities, now: Placement, forces: _Forces
-    ) -> tuple[Tensor, Tensor]:
-        """Energy [J] `[*batch]` gained in a step beyond the forces' work on what has moved, and the kinetic energies together."""
-        a, step = objective.articulation, objective.step
-        first, last = (
-            kinetic_energy(a, Motion(at, v).rates) + rotor_energy(a, v, objective.terms)
-            for at, v in ((step.previous, state.v + 0.5 * state.steady), (now, end.v + 0.5 * end.steady))
-        )
-        lost = potential_energy(step.previous, step.gravity) - potential_energy(now, step.gravity)
-        work = step.dt * ((forces.rough + forces.smooth) * end.average).sum(-1)
-        return last - first - lost - work, first + last + fall(objective)
-
-    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
-        """Where nothing pushes, nor would where inertia alone leads: there the energy that an easier step would take is worth two
-        shorter ones."""
+    def halves(self, objective: BalanceObjective, end: Velocities, solved: Tensor) -> Tensor:
+        """Where nothing pushes, nor would where inertia alone leads, and where nothing but its energy is wrong with the step: there
+        the energy that an easier step would take is worth two shorter ones."""
         step = objective.step
-        return objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(q) == 0
+        free = objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(end.q) == 0
+        return free | (solved & end.overdrawn)
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""
@@ -206,7 +207,27 @@ class _PaperStep(EnergyMomentum):
         rates, average = _averages(objective, state, now)
         rates = torch.cat((rates[..., :3], rates[..., 3:] + 0.5 * (h * step.gravity)[..., None, :, None]), -1)
         momentum = _momentum(objective, now, rates, average) + 0.5 * h * (1 - forces.ahead) * forces.smooth
-        return _ended(objective, state, now, momentum, forces, average), None
+        end = _ended(objective, state, now, momentum, forces, average)
+        return _Gain(objective, state, end, now, forces).end, None
+
+
+class _Gain:
+    """What a step has gained beyond the forces' work on what has moved: `energy` and the `kinetic` energies at its start and end
+    together, that of a fall over it included, [J] `[*batch]`; and the state at its `end` with all accounts kept."""
+
+    def __init__(self, objective: BalanceObjective, state: Velocities, end: Velocities, now: Placement, forces: _Forces) -> None:
+        a, step = objective.articulation, objective.step
+        with torch.no_grad():  # which steps are refused does not change smoothly
+            first, last = (
+                kinetic_energy(a, Motion(at, v).rates) + rotor_energy(a, v, objective.terms)
+                for at, v in ((step.previous, state.v + 0.5 * state.steady), (now, end.v + 0.5 * end.steady))
+            )
+            lost = potential_energy(step.previous, step.gravity) - potential_energy(now, step.gravity)
+            work = step.dt * ((forces.rough + forces.smooth) * end.average).sum(-1)
+            self.energy, self.kinetic = last - first - lost - work, first + last + fall(objective)
+            peak = torch.maximum(state.peak, torch.maximum(first, last) + fall(objective))
+            surplus = torch.maximum(state.surplus + self.energy, -RESERVE * peak)
+        self.end = replaced(end, surplus=surplus, peak=peak)
 
 
 class _Forces:
@@ -254,7 +275,16 @@ def _ended(
     before = (inertia * state.v[..., None, :]).sum(-1)
     other = momentum - before - h * forces.smooth - (1 - share) * impulse
     (lag,) = _solved(inertia, -forces.ahead * other)
-    return Velocities(**after(objective, now), v=v, push=push, steady=share * push, lag=lag, average=average)
+    return Velocities(
+        **after(objective, now),
+        v=v,
+        push=push,
+        steady=share * push,
+        lag=lag,
+        average=average,
+        surplus=state.surplus,
+        peak=state.peak,
+    )
 
 
 def _solved(inertia: Tensor, *momenta: Tensor) -> tuple[Tensor, ...]:

@@ -123,9 +123,9 @@ class Integrator(Protocol[S]):
         """The state after the step of an objective that ended at q, and who may not go on from there; None: no world."""
         ...
 
-    def halves(self, objective: BalanceObjective, q: Tensor) -> Tensor:
-        """Worlds `[*batch]` that had better take two shorter steps than an easier one, if that which was left at q is unsolved or
-        refused."""
+    def halves(self, objective: BalanceObjective, end: S, solved: Tensor) -> Tensor:
+        """Worlds `[*batch]` that had better take two shorter steps than an easier one, if that which ended like this is unsolved or
+        refused; solved: which were, before they were refused."""
         ...
 
     def resized(self, articulation: Articulation, state: S, dt: Tensor, new: Tensor) -> S:

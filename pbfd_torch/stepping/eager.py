@@ -180,6 +180,7 @@ class EagerStepper(Generic[S]):
         """The rest of a step that the first solver has left at `solution`, from which the integrator would go on to `advanced` but
         for the worlds that it has refused `[*batch]`: these and the unsolved ones are led along detours or try easier steps, and
         those that still are unsolved shorter ones."""
+        arrived = solution.solved
         if refused is not None:
             status = torch.where(refused & solution.solved, int(Status.STALLED), solution.status)
             solution = dataclasses.replace(solution, status=status.to(torch.int32))
@@ -193,7 +194,7 @@ class EagerStepper(Generic[S]):
         q = solution.q
         detours: list[Detour] = []
         if easier and self._may_halve(1):
-            index = index[self.integrator.halves(objective, q).reshape(-1)[index]]
+            index = index[self.integrator.halves(objective, advanced, arrived).reshape(-1)[index]]
             if len(index := self._halvable(solution, index, 2)):
                 advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2)
                 detours.append(detour)
