@@ -13,9 +13,9 @@ from pbfd_torch.contact.hazards import Hazard
 from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.polytope import thickness_of
-from pbfd_torch.contact.primitives import BoxSurface
+from pbfd_torch.contact.primitives import BoxSurface, SegmentSurface, SphereSurface
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Shape, Sphere
-from pbfd_torch.contact.surface import Tangent
+from pbfd_torch.contact.surface import Surface, Tangent
 from pbfd_torch.models.stacks import solid_box
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
@@ -54,27 +54,60 @@ def test_a_plate_stops_what_would_jump_it(plate: str, shape: Shape, speed: float
     assert not bool((rollout.hazards & ~int(Hazard.OVERLAPPED)).any())  # at 100 m/s the contact itself gives way by a centimetre
 
 
-def test_tangent_planes_stand_in_for_what_is_passed() -> None:
-    """Where a point may come past the middle, the field is the plane that touches the box nearest to it, else the box's own; its
-    normal and curvature are the derivatives of both."""
-    box = BoxSurface(torch.tensor([[0.3, 0.2, 0.1]], dtype=torch.float64))
+SOLIDS: dict[str, Surface] = {
+    "box": BoxSurface(torch.tensor([[0.3, 0.2, 0.1]], dtype=torch.float64)),
+    "ball": SphereSurface(torch.tensor([0.1], dtype=torch.float64)),
+    "capsule": SegmentSurface(
+        torch.tensor([[0.0, 0.0, -0.2]], dtype=torch.float64),
+        torch.tensor([[0.0, 0.1, 0.2]], dtype=torch.float64),
+        torch.tensor([0.1], dtype=torch.float64),
+    ),
+}
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+def test_tangent_planes_stand_in_for_what_is_passed(solid: str) -> None:
+    """Where the free motion leads deep into the solid, the field is the plane that touches it nearest to the start; where only
+    other forces may, the solid's own down to a quarter of its thickness and the plane from the middle on; else its own. Its normal
+    is its derivative everywhere."""
+    own = SOLIDS[solid]
     random = generator(3)
-    start = 2 * torch.rand(200, 3, dtype=torch.float64, generator=random) - 1
-    moves = torch.rand(200, dtype=torch.float64, generator=random)
-    tangent = Tangent.before(box, start, moves, 0.2)
-    distance = box.field(start).distance
-    assert torch.equal(tangent.where, (distance > 0) & (moves > distance + 0.1))
-    assert 20 < int(tangent.where.sum()) < 180
+    start = 2 * torch.rand(400, 3, dtype=torch.float64, generator=random) - 1
+    freely, further = torch.rand(2, 400, dtype=torch.float64, generator=random)
+    tangent = Tangent.before(own, start, freely, freely + 0.3 * further, 0.2)
+    distance = own.field(start).distance
+    led = (distance > 0) & (freely > distance + 0.05)
+    lost = (distance > 0) & (freely + 0.3 * further > distance + 0.1)
+    assert torch.equal(tangent.passed, led | lost)
+    assert torch.equal(tangent.near, ~led)
+    assert min(int(x.sum()) for x in (led, lost & ~led, ~lost & ~led)) > 20
     assert float((tangent.field(start).distance - distance).abs().max()) <= 1e-15
-    there = start + 0.3 * torch.randn(200, 3, dtype=torch.float64, generator=random)
+    there = start + 0.3 * torch.randn(400, 3, dtype=torch.float64, generator=random)
+    field, alone = tangent.field(there), own.field(there).distance
+    height = ((there - start) * own.field(start).direction).sum(-1) + distance
+    kept, plane = ~tangent.passed | (~led & (height >= -0.05)), led | (lost & (height <= -0.1))
+    assert torch.equal(field.distance[kept], alone[kept])
+    assert float((field.distance - height)[plane].abs().max()) <= 1e-15
+    smooth = (alone > 1e-3) | plane
+    slope = derivative(lambda d: tangent.field(there + d).distance, 3, (400,), largest=1e-4)
+    assert relative_error(field.normal[smooth][..., None], slope[smooth][..., None]) <= 1e-7
+    assert float(field.curvature[plane].abs().max()) == 0
+    assert torch.equal(field.curvature[kept], own.field(there).curvature[kept])
+
+
+def test_tangent_planes_bend_as_they_take_over() -> None:
+    """The curvature is the derivative of the normal, in the layer where a ball's own field goes over into the plane's too, and no
+    point is pushed towards the other side."""
+    ball, random = SOLIDS["ball"], generator(4)
+    start = torch.nn.functional.normalize(torch.randn(400, 3, dtype=torch.float64, generator=random), dim=-1)
+    still, far = torch.zeros(400, dtype=torch.float64), torch.full((400,), 2.0, dtype=torch.float64)
+    tangent = Tangent.before(ball, start, still, far, 0.2)
+    beside = torch.randn(400, 3, dtype=torch.float64, generator=random) * 0.1
+    there = start * torch.linspace(-0.02, 0.08, 400, dtype=torch.float64)[:, None] + beside
     field = tangent.field(there)
-    own = ~tangent.where
-    assert torch.equal(field.distance[own], box.field(there).distance[own])
-    outside = (box.field(there).distance > 1e-3) | tangent.where
-    slope = derivative(lambda d: tangent.field(there + d).distance, 3, (200,), largest=1e-4)
-    assert relative_error(field.normal[outside][..., None], slope[outside][..., None]) <= 1e-7
-    assert bool((field.curvature[tangent.where] == 0).all())
-    assert torch.equal(field.curvature[own], box.field(there).curvature[own])
+    slope = derivative(lambda d: tangent.field(there + d).normal, 3, (400,), largest=1e-5)
+    assert relative_error(field.curvature, slope) <= 1e-6
+    assert float((field.normal * start).sum(-1).min()) >= 0
 
 
 def test_thickness() -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.primitives import BoxSurface
 from pbfd_torch.contact.surface import Placed, Tangent
-from pbfd_torch.tensors.vectors import applied, in_frames
+from pbfd_torch.tensors.vectors import applied, in_frames, mapped
 from pbfd_torch.tensors.worlds import replaced
 
 
@@ -36,7 +36,7 @@ class BallBoxPairs(Finder):
         # no new checks: the sizes were checked when the shapes were made
         return Placed(replaced(_TEMPLATE, half_extents=self.half_extents[index]), self.frame[index])
 
-    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+    def find(self, bodies: Tensor, ahead: Tensor, reach: Tensor) -> Slots:
         """See `Finder`."""
         first, second = bodies[..., self.first, :3, :], bodies[..., self.second, :3, :]
         centers = applied(first[..., :3], self.position) + first[..., 3]
@@ -46,7 +46,9 @@ class BallBoxPairs(Finder):
         which, filled, dropped = nearest(gap, gap < moves, self.slots)
         thickness = 2 * self.half_extents.amin(-1)[which]
         seen = seen.take_along_dim(which[..., None].expand(*which.shape, 3), -2)
-        surface = Tangent.before(self._box(which), seen, moves.gather(-1, which), thickness)
+        later = in_frames(ahead[..., self.second, :3, :], mapped(ahead[..., self.first, :3, :], self.position))
+        freely = torch.linalg.vector_norm(later.take_along_dim(which[..., None].expand(*which.shape, 3), -2) - seen, dim=-1)
+        surface = Tangent.before(self._box(which), seen, freely, moves.gather(-1, which), thickness)
         return Slots(
             filled=filled,
             pair=self.pair[which],

@@ -43,9 +43,9 @@ class Finder(ABC):
     slots: int = field(kw_only=True)
 
     @abstractmethod
-    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
-        """Candidates between bodies that stand at `bodies` `[*batch, nbody, 4, 4]` and move at most `reach` `[*batch, nbody]` [m]
-        in the step; constants of the step."""
+    def find(self, bodies: Tensor, ahead: Tensor, reach: Tensor) -> Slots:
+        """Candidates between bodies that stand at `bodies` `[*batch, nbody, 4, 4]`, would freely move to `ahead` in the step, like
+        `bodies`, and move at most `reach` `[*batch, nbody]` [m]; constants of the step."""
 
     def grown(self) -> Self:
         """The same finder with twice as many slots."""

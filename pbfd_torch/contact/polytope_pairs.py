@@ -93,7 +93,7 @@ class PolytopePairs(Finder):
     def _all_boxes(self) -> bool:
         return bool(self.boxes.all())
 
-    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+    def find(self, bodies: Tensor, ahead: Tensor, reach: Tensor) -> Slots:
         """See `Finder`."""
         batch = bodies.shape[:-3]
         poses = bodies[..., self.body, :, :] @ self.frame

@@ -63,10 +63,9 @@ class RoundPairs(Finder):
             slots=slots,
         )
 
-    def find(self, bodies: Tensor, reach: Tensor) -> Slots:
+    def find(self, bodies: Tensor, ahead: Tensor, reach: Tensor) -> Slots:
         """See `Finder`."""
-        poses = torch.stack((bodies[..., self.first, :, :], bodies[..., self.second, :, :]), -3).repeat_interleave(2, -3)
-        ends = applied(poses[..., :3, :3], self.axes) + poses[..., :3, 3]  # [*, m, 4, 3]
+        ends, later = self._ends(bodies), self._ends(ahead)
         a, b, c, d = ends.unbind(-2)
         along = _places(a, b, c, d)  # [*, m, 3]
         centers = a[..., None, :] + along[..., None] * (b - a)[..., None, :]
@@ -82,7 +81,11 @@ class RoundPairs(Finder):
         solid = replaced(_TEMPLATE, start=axis[..., 2, :], end=axis[..., 3, :], radius=self.radii[which][..., 1])
         seen = in_frames(bodies[..., self.second, :3, :][..., None, :, :], centers)
         seen = seen.flatten(-3, -2).take_along_dim(order[..., None].expand(*order.shape, 3), -2)
-        surface = Tangent.before(solid, seen, moves.squeeze(-1).gather(-1, which), 2 * self.radii[which][..., 1])
+        shift = (later - ends).take_along_dim(which[..., None, None].expand(*which.shape, 4, 3), -3)
+        carried = shift[..., 0, :] + share * (shift[..., 1, :] - shift[..., 0, :])
+        freely = torch.linalg.vector_norm(carried[..., None, :] - shift[..., 2:, :], dim=-1).amax(-1)
+        thickness = 2 * self.radii[which][..., 1]
+        surface = Tangent.before(solid, seen, freely, moves.squeeze(-1).gather(-1, which), thickness)
         return Slots(
             filled=filled,
             pair=self.pair[which],
@@ -93,6 +96,11 @@ class RoundPairs(Finder):
             surface=surface,
             dropped=dropped,
         )
+
+    def _ends(self, bodies: Tensor) -> Tensor:
+        """Of the axes, `[*batch, m, 4, 3]`."""
+        poses = torch.stack((bodies[..., self.first, :, :], bodies[..., self.second, :, :]), -3).repeat_interleave(2, -3)
+        return applied(poses[..., :3, :3], self.axes) + poses[..., :3, 3]
 
 
 # its numbers are replaced at once: parameters were checked when the shapes were made

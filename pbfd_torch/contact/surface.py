@@ -108,38 +108,60 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """A convex solid, or for the points `where` `[*batch, n]` the half-space behind a plane that touches it. A point that moves far
-    in one step ends beyond the solid, where its own distance knows nothing of what lies between; the plane does.
+    """A convex solid that nothing jumps. A point that moves far in one step ends beyond the solid, where its own distance φ knows
+    nothing of what lies between; a plane that touches the solid, at the signed distance π, does. It stands for the solid where the
+    free motion leads deeper than a quarter of the thickness. Where other forces might lead past the middle, φ goes over into π,
+    smoothly, between these depths below the plane: nearer to it, where contacts hold, the solid keeps its shape. (A plane alone
+    would turn with a ball, and push past its centre.)
 
-    normal, offset: of the planes, `[*batch, n, 3]` and `[*batch, n]` [m]."""
+    passed, near: bool `[*batch, n]`, for which points the plane is there at all, and for which of them φ counts near it.
+    normal, offset: of the planes, `[*batch, n, 3]` and `[*batch, n]` [m]. thickness: `[*, n]` [m]."""
 
     solid: Surface
-    where: Tensor
+    passed: Tensor
+    near: Tensor
     normal: Tensor
     offset: Tensor
+    thickness: Tensor
 
     @staticmethod
-    def before(solid: Surface, points: Tensor, moves: Tensor, thickness: float | Tensor) -> Tangent:
-        """The planes nearest to points `[*batch, n, 3]` outside the solid, which may move so far `[*batch, n]` [m] that they come
-        past the middle of its `thickness` [m]."""
+    def before(solid: Surface, points: Tensor, freely: Tensor, reach: Tensor, thickness: float | Tensor) -> Tangent:
+        """The planes nearest to points `[*batch, n, 3]` outside the solid; these move by `freely` in their free motion and by
+        `reach` at most, `[*batch, n]` [m]. thickness: the solid's [m]."""
         start = solid.field(points)
         normal = start.direction
-        past = (start.distance > 0) & (moves > start.distance + 0.5 * thickness)
-        return Tangent(solid, past, normal, dot(points, normal) - start.distance)
+        across = torch.as_tensor(thickness, dtype=points.dtype, device=points.device)
+        outside = start.distance > 0
+        led = outside & (freely > start.distance + 0.25 * across)
+        passed = led | (outside & (reach > start.distance + 0.5 * across))
+        return Tangent(solid, passed, ~led, normal, dot(points, normal) - start.distance, across)
 
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
-        own, where = self.solid.field(points), self.where[..., None]
-        distance = torch.where(self.where, dot(points, self.normal) - self.offset, own.distance)
-        normal = torch.where(where, self.normal, own.direction)
-        return Field(distance, normal, lambda: torch.where(where[..., None], 0.0, own.bend))
+        own, height = self.solid.field(points), dot(points, self.normal) - self.offset
+        layer = (0.25 * self.thickness).clamp_min(torch.finfo(height.dtype).eps)
+        x = torch.where(self.passed, torch.where(self.near, (height / layer + 2).clamp(0, 1), 0.0), 1.0)
+        share, slope = x * x * x * (10 - x * (15 - 6 * x)), 30 * (x * (1 - x)).square() / layer  # twice differentiable
+        above = own.distance - height
+        along = 1 - share + slope * above
+        normal = torch.addcmul(share[..., None] * own.normal, along[..., None], self.normal)
+
+        def curvature() -> Tensor:
+            bend = 60 * x * (1 - x) * (1 - 2 * x) / layer.square() * above
+            turning = slope[..., None] * (own.normal - self.normal) + 0.5 * bend[..., None] * self.normal
+            turned = outer(self.normal, turning)
+            return torch.addcmul(turned + turned.mT, share[..., None, None], own.curvature)
+
+        return Field(own.distance - (1 - share) * above, normal, curvature, exact=False)
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
         return replaced(
             self,
             solid=self.solid.take(worlds),
-            where=worlds.pick(self.where, 1),
+            passed=worlds.pick(self.passed, 1),
+            near=worlds.pick(self.near, 1),
             normal=worlds.pick(self.normal, 2),
             offset=worlds.pick(self.offset, 1),
+            thickness=worlds.pick(self.thickness, 1),
         )

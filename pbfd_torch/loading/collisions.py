@@ -44,10 +44,10 @@ def overlapping(
     for term in contact_terms(exact, colliders, (), ContactRules(friction=None, excluded=excluded)):
         if isinstance(term, BodyContact):
             finder = term.finder
-            slots = finder.find(bodies, closer)
+            slots = finder.find(bodies, bodies, closer)
             while bool(slots.dropped):
                 finder = finder.grown()
-                slots = finder.find(bodies, closer)
+                slots = finder.find(bodies, bodies, closer)
             pairs = torch.stack((slots.first, slots.second), -1)[slots.filled].sort(-1).values
             found |= {(a, b) for a, b in pairs.tolist()}
     return tuple((exact.link_names[a], exact.link_names[b]) for a, b in sorted(found))

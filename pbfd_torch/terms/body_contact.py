@@ -99,7 +99,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         ahead = torch.cat((target.expand_as(links), obstacles), -3)
         with torch.no_grad():  # which candidates there are does not change smoothly; where they are does
             reach = 1.5 * self._travel(bodies, ahead) + self.slack
-        slots = self._found(bodies, reach)
+        slots = self._found(bodies, ahead, reach)
         first, second = of_slots(bodies, slots.first), of_slots(bodies, slots.second)
         turned = second[..., :3].mT @ first[..., :3]
         start = in_frames(second, mapped(first, slots.position)) + step.dt[..., None, None] * self._running(slots, turned)
@@ -136,9 +136,9 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         belt = torch.cat((still, torch.stack([x.belt for x in self.obstacles])))
         return belt[slots.second] - applied(turned, belt[slots.first])
 
-    def _found(self, bodies: Tensor, reach: Tensor) -> Slots:
+    def _found(self, bodies: Tensor, ahead: Tensor, reach: Tensor) -> Slots:
         finder = self.finder
-        slots = finder.find(bodies, reach)
+        slots = finder.find(bodies, ahead, reach)
         if self.overflow is Overflow.FLAG:
             return slots
         while bool(slots.dropped.any()):
@@ -148,7 +148,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
                     "give more slots, or choose Overflow.FLAG or Overflow.GROW"
                 )
             finder = finder.grown()
-            slots = finder.find(bodies, reach)
+            slots = finder.find(bodies, ahead, reach)
         return slots
 
     def _gaps(self, slots: Slots, bodies: Tensor) -> Tensor:

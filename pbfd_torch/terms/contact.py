@@ -179,7 +179,7 @@ class Contact(ContactLaws[PreparedContact]):
         free = functools.cache(lambda: self._centers(step.target_poses))
         if math.isfinite(self.thickness):
             moves = torch.linalg.vector_norm(free() - centers, dim=-1)
-            surface = Tangent.before(surface, seen(frame, centers), moves, self.thickness)
+            surface = Tangent.before(surface, seen(frame, centers), moves, moves, self.thickness)
 
         def gap(points: Tensor, rotations: Tensor) -> Tensor:
             return -self._depth(surface.field(seen(frame, points)), frame, rotations)
