@@ -11,7 +11,7 @@ from typing import Any, Generic, Self, TypeVar, cast
 import torch
 from torch import Tensor
 
-from pbfd_torch.balance.dynamics import bias_force, mass_matrix
+from pbfd_torch.balance.dynamics import bias_force, kinetic_energy, mass_matrix
 from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
@@ -28,6 +28,7 @@ from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.load import Term
 from pbfd_torch.tree.articulation import Articulation, force_scale
+from pbfd_torch.tree.kinematics import Motion
 
 R = TypeVar("R", bound=State)
 MOST_EVALUATIONS, FEWEST_EVALUATIONS = 5000, 200
@@ -141,8 +142,10 @@ class EagerStepper(Generic[S]):
         others = others - bias_force(a, q, v, self.scene.gravity)
         columns = solved_positive(mass_matrix(a, q, self.scene.terms), torch.stack((abrupt, others), -1))
         by_abrupt, by_others = columns.unbind(-1)
-        # an impact within the step has given nothing before it
-        steady = calm(objective, objective.step.previous, self.step_size[..., None] * by_abrupt)
+        # an impact within the step has given nothing before it; what holds the others back has, however hard they press
+        now, h = objective.step.previous, self.step_size[..., None]
+        alone, together = (kinetic_energy(a, Motion(now, h * x).rates) for x in (by_others, by_others + by_abrupt))
+        steady = calm(objective, now, h * by_abrupt) | (together <= alone)
         acceleration = by_others + torch.where(steady[..., None], by_abrupt, 0.0)
         return Trial(end.q, torch.where(solved[..., None], acceleration, 0.0), solved)
 
