@@ -97,6 +97,30 @@ class Continuation:
         return climbed(solver, self.tolerance, [functools.partial(eased, *rung) for rung in self.ladder], start)
 
 
+@dataclass(frozen=True)
+class Following:
+    """Stages that are as of a step that grows from a share of its length to the whole: their roots follow the motion from its
+    start."""
+
+    shares: tuple[float, ...] = (2**-8, 2**-6, 2**-4, 2**-2)
+    tolerance: float = 1e-2
+    kind: int = 1
+    status: Status = Status.CONTINUED
+
+    @property
+    def stages(self) -> int:
+        """See `Detour`."""
+        return len(self.shares)
+
+    def lead(self, solver: Descent, objective: Relaxable, start: Tensor) -> list[Solution]:
+        """See `Detour`."""
+
+        def shorter(share: float, _: Tensor) -> Relaxable:
+            return objective.shortened(share)
+
+        return climbed(solver, self.tolerance, [functools.partial(shorter, x) for x in self.shares], start)
+
+
 WIDTHS = Continuation(((1000.0, 1.0), (100.0, 1.0), (10.0, 1.0)))
 STIFFNESSES = Continuation(((1.0, 1e-3), (1.0, 1e-2), (1.0, 1e-1)), tolerance=1e-2)
 SOON = 40  # evaluations
@@ -107,12 +131,14 @@ class Fallbacks:
     """Attributes:
     direct: solves the problem itself.
     last: solves the problem from where a detour has led.
+    along: tried by worlds whose root has strayed.
     detours: tried in turn.
     stage: solves every stage of a detour.
     """
 
     direct: Descent = field(default_factory=lambda: Descent(max_evaluations=200))
     last: Descent = field(default_factory=lambda: Descent(max_evaluations=100))
+    along: Detour = Following()
     detours: tuple[Detour, ...] = (WarmStart(), WIDTHS, STIFFNESSES)
     stage: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
 
@@ -127,31 +153,72 @@ class Fallbacks:
     ) -> Solution:
         """As `Descent.solve`; worlds that needed a detour say so in their status. Counts include the detours. budget: as in
         `rescued`, and enough for the direct way."""
-        solution = self.direct.solve(objective, guess, retreat)
-        return self.rescued(objective, solution, guess, guess if retreat is None else retreat, budget)
+        solution = doubted(objective, self.direct.solve(objective, guess, retreat))
+        return self.accepted(self.rescued(objective, solution, guess, guess if retreat is None else retreat, budget))
 
     def rescued(
         self, objective: Relaxable, solution: Solution, guess: Tensor, start: Tensor, budget: int | Tensor | None = None
     ) -> Solution:
-        """The solution of the direct way with its unsolved worlds led along the detours, from `start`; what these leave tries the
-        direct way from `guess` after all, as the retreat from it may have been the mistake. Both starts are `[*batch, nq]`.
-        budget: evaluations that a world may spend in all, those of the solution included, a number or `[*batch]`; None: any. A way
-        that might take more is not taken."""
-        for detour in self.detours:
-            index = solution.within(budget, detour.stages * self.stage.max_evaluations + self.last.max_evaluations)
-            if len(index) == 0:
-                continue
-            part = objective.take(index)
-            climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
-            climbs.append(self.last.solve(part, climbs[-1].q))
-            solution = merged(solution, index, climbs, detour.kind, detour.status)
-        if guess is start:
+        """The solution of the direct way with its unsolved worlds led from `start` to where they are to be: those that have strayed
+        along the motion, those without a root along the detours; what these leave tries the direct way from `guess` after all, as
+        the retreat from it may have been the mistake. Both starts are `[*batch, nq]`. Roots that have strayed stay unsolved, but
+        for those that the motion leads to. budget: evaluations that a world may spend in all, those of the solution included, a
+        number or `[*batch]`; None: any. A way that might take more is not taken."""
+        if len(solution.unsolved) == 0:
             return solution
-        index = solution.within(budget, self.last.max_evaluations)
+        astray = objective.strayed(solution.q).reshape(-1)[solution.unsolved]
+        solution = self._led(self.along, objective, solution, solution.unsolved[astray], start, budget)
+        for detour in self.detours:
+            solution = self._led(detour, objective, solution, self._rootless(solution), start, budget)
+        index = solution.within(budget, self.last.max_evaluations, self._rootless(solution))
+        if len(index) and guess is not start:
+            part = objective.take(index)
+            again = doubted(part, self.last.solve(part, guess.reshape(-1, guess.shape[-1])[index]))
+            solution = merged(solution, index, [again], None, Status.SOLVED)
+        return solution
+
+    def accepted(self, solution: Solution) -> Solution:
+        """The solution with roots that have strayed as good enough."""
+        return replaced(solution, ~solution.solved & self._balanced(solution), Status.SOLVED)
+
+    def _balanced(self, solution: Solution) -> Tensor:
+        """Which worlds are at a root, wherever that is, `[*batch]` bool."""
+        return solution.residual_norm <= self.last.tolerance_for(solution.q.dtype)
+
+    def _rootless(self, solution: Solution) -> Tensor:
+        """Positions `[n]` in the flattened batch of the unsolved worlds that are at no root."""
+        return solution.unsolved[~self._balanced(solution).reshape(-1)[solution.unsolved]]
+
+    def _led(
+        self,
+        detour: Detour,
+        objective: Relaxable,
+        solution: Solution,
+        index: Tensor,
+        start: Tensor,
+        budget: int | Tensor | None,
+    ) -> Solution:
+        """The solution with those of the worlds at `index` led along a detour that can afford it."""
+        index = solution.within(budget, detour.stages * self.stage.max_evaluations + self.last.max_evaluations, index)
         if len(index) == 0:
             return solution
-        again = self.last.solve(objective.take(index), guess.reshape(-1, guess.shape[-1])[index])
-        return merged(solution, index, [again], None, Status.SOLVED)
+        part = objective.take(index)
+        climbs = detour.lead(self.stage, part, start.reshape(-1, start.shape[-1])[index])
+        if detour is self.along:
+            climbs.append(self.stage.solve(part, climbs[-1].q))
+        else:
+            climbs.append(doubted(part, self.last.solve(part, climbs[-1].q)))
+        return merged(solution, index, climbs, detour.kind, detour.status)
+
+
+def doubted(objective: Relaxable, solution: Solution) -> Solution:
+    """The solution with worlds unsolved whose roots have strayed."""
+    return replaced(solution, solution.solved & objective.strayed(solution.q), Status.STALLED)
+
+
+def replaced(solution: Solution, where: Tensor, status: Status) -> Solution:
+    """The solution with another status in the worlds in `where` `[*batch]`."""
+    return dataclasses.replace(solution, status=torch.where(where, int(status), solution.status).to(torch.int32))
 
 
 def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int | None, status: Status) -> Solution:

@@ -113,6 +113,14 @@ class Relaxable(Objective, Protocol):
         """The minimisation that is left with the friction's normal forces frozen as they are at q."""
         ...
 
+    def shortened(self, share: float) -> Relaxable:
+        """The problem of a motion that has gone on for a `share` ≤ 1 of its time only; its root is the nearer to the start."""
+        ...
+
+    def strayed(self, q: Tensor) -> Tensor:
+        """Whether a root at q is too far from the start to be trusted as where the motion leads, `[*batch]` bool."""
+        ...
+
 
 def weighted_error(residual: Tensor, scale: Tensor, rounding: Tensor | float, tolerance: float) -> Tensor:
     """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`."""
@@ -155,10 +163,10 @@ class Solution:
         asks first makes the host wait for a device; it is known after that."""
         return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
 
-    def within(self, budget: int | Tensor | None, cost: int | Tensor) -> Tensor:
-        """Those of the `unsolved` worlds that may spend as many evaluations more: their budget is a number or `[*batch]`; None: they
-        all may."""
-        index = self.unsolved
+    def within(self, budget: int | Tensor | None, cost: int, index: Tensor | None = None) -> Tensor:
+        """Those of the worlds at `index` (None: the `unsolved` ones) that may spend `cost` evaluations more: their budget is a number
+        or `[*batch]`; None: they all may."""
+        index = self.unsolved if index is None else index
         if budget is None or len(index) == 0:
             return index
         return index[((self.evaluations + cost) <= budget).reshape(-1)[index]]

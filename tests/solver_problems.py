@@ -124,6 +124,12 @@ class FunctionObjective:
     def widened(self: T, factor: float) -> T:
         return dataclasses.replace(self, ease=self.ease._replace(width=self.ease.width * factor))
 
+    def shortened(self: T, share: float) -> T:
+        return self
+
+    def strayed(self, q: Tensor) -> Tensor:
+        return torch.zeros_like(q[..., 0], dtype=torch.bool)
+
     def lagged(self: T, q: Tensor) -> T:
         return dataclasses.replace(self, ease=self.ease._replace(lagged=True))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +25,7 @@ from pbfd_torch.terms.load import (
     Foreboding,
     Frictional,
     Hazardous,
+    Inert,
     Load,
     OneSided,
     Potential,
@@ -33,9 +35,10 @@ from pbfd_torch.terms.load import (
     Term,
 )
 from pbfd_torch.tree.articulation import Articulation, force_scale, lever, reach
-from pbfd_torch.tree.kinematics import Placement, place, retract
+from pbfd_torch.tree.kinematics import Placement, difference, place, retract
 
 NEGLIGIBLE = 0.1  # of the scale, at most, may be left to rounding
+FARTHEST = 0.5 * math.pi  # [rad] that contacts may turn a joint by in a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +140,24 @@ class BalanceObjective:
     def widened(self, factor: float) -> Self:
         """The same step with friction smooth over `factor` times as wide a range of slip."""
         return self._with([term.widened(factor) if isinstance(term, Frictional) else term for term in self.terms])
+
+    def shortened(self, share: float) -> Self:
+        """The same step with the inertial forces of one that is `share` ≤ 1 times as long: it ends the nearer to its start."""
+        terms = [term.shortened(share) if isinstance(term, Inert) else term for term in self.terms]
+        prepared = [
+            new.prepare(self.step) if isinstance(new, Inert) else old for new, old in zip(terms, self.prepared, strict=True)
+        ]
+        return dataclasses.replace(self, terms=terms, prepared=prepared)
+
+    def strayed(self, q: Tensor) -> Tensor:
+        """Whether a step that ended at q has turned a joint by more than a quarter turn, and not because its free motion leads
+        there, while something touches, `[*batch]` bool: such a root need not be where the motion goes."""
+        a = self.articulation
+        far = torch.minimum(*(self.turn(difference(a, x, q)) for x in (self.step.previous.q, self.guess))) > FARTHEST
+        # what is in the host's own memory it may look at; asking a device would make it wait
+        if far.device.type == "cpu" and not bool(far.numpy().any()):
+            return far
+        return far & (self.push(q) > 0)
 
     def seen_from(self, distance: float) -> Self:
         """The same step with normal forces that set in `distance` [m] before anything touches."""

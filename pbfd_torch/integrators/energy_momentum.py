@@ -165,7 +165,7 @@ class EnergyMomentum:
                 spurious = dt * (objective.evaluate(q).residual * average).sum(-1)
                 excess = gain.energy - spurious > EXCESS * gain.kinetic
                 overdrawn = replaced(gain.end, surplus=gain.end.surplus - spurious).overdrawn
-            return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn
+            return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn | objective.strayed(q)
 
         return gain.end, refused
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Integrator, Starter, State, after, calm, fresh
+from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fresh
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
 from pbfd_torch.tree.articulation import Articulation
@@ -81,13 +82,14 @@ class ImplicitEuler:
             gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, None]:
+    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, Refusal]:
         """See `Integrator`."""
         a, h = objective.articulation, objective.step.dt[..., None]
         gained = difference(a, state.q, q) / h - self.velocity(a, state, objective.step.dt)
         smooth = calm(objective, objective.step.previous, gained)[..., None]
         acceleration = torch.where(smooth, gained / h, 0.0)
-        return Positions(**after(objective, place(a, q)), q_previous=state.q, acceleration=acceleration), None
+        end = Positions(**after(objective, place(a, q)), q_previous=state.q, acceleration=acceleration)
+        return end, functools.partial(objective.strayed, q)
 
     def halves(self, objective: BalanceObjective, end: State, solved: Tensor) -> Tensor:
         """None: an easier step is good enough."""

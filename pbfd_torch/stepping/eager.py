@@ -193,7 +193,7 @@ class EagerStepper(Generic[S]):
         easier = self.integrator.easier
         if not easier and isinstance(self.solver, Fallbacks):
             solution = self.solver.rescued(objective, solution, objective.guess, state.q, self.evaluations)
-            advanced, _ = self.integrator.advance(objective, state, solution.q)  # without an easier step nothing is refused
+            advanced, _ = self.integrator.advance(objective, state, solution.q)  # what is refused still has found nothing better
         q = solution.q
         detours: list[Detour] = []
         if easier and self._may_halve(1):
@@ -217,14 +217,13 @@ class EagerStepper(Generic[S]):
                 break
             advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2**halvings)
             detours.append(detour)
+        if not easier and isinstance(self.solver, Fallbacks):
+            solution = self.solver.accepted(solution)
         return advanced, solution, Way(q, tuple(detours), objective)
 
     def _halvable(self, solution: Solution, index: Tensor, parts: int) -> Tensor:
         """Which of these worlds can afford the first attempt at each of so many shorter steps."""
-        if len(index) == 0:
-            return index
-        spent = (solution.evaluations + parts * _attempt_of(self.first_solver)).reshape(-1)[index]
-        return index[spent <= self._budget(index)]
+        return solution.within(self.evaluations, parts * _attempt_of(self.first_solver), index)
 
     def _budget(self, index: Tensor) -> int | Tensor:
         return self.evaluations.reshape(-1)[index] if isinstance(self.evaluations, Tensor) else self.evaluations

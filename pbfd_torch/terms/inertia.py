@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.vectors import trace_minus
-from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.load import ChordLoad, LinkLoad, StepContext
 from pbfd_torch.tree.kinematics import Chord, Placement
 from pbfd_torch.tree.rotations import skew
@@ -31,10 +31,19 @@ class PreparedInertia:
 
 @dataclass(frozen=True)
 class Inertia:
-    """r_i = κ Σ tr(D S (ŝ_i T)ᵀ), with ŝ_i T taken where the integrator says (`StepContext.share`)."""
+    """r_i = κ Σ tr(D S (ŝ_i T)ᵀ), with ŝ_i T taken where the integrator says (`StepContext.share`). `length`: see `shortened`."""
+
+    length: float = 1.0
 
     def prepare(self, step: StepContext) -> PreparedInertia:
-        return PreparedInertia(step.weight[..., None, None, None], step.target_poses, step.previous, step.share)
+        start, target = step.previous, step.target_poses
+        if self.length < 1:
+            target = torch.lerp(start.poses, target, self.length)
+        return PreparedInertia((step.weight / self.length**2)[..., None, None, None], target, start, step.share)
+
+    def shortened(self, share: float) -> Self:
+        """See `Inert`."""
+        return replaced(self, length=share * self.length)
 
     def load(self, prepared: PreparedInertia, placement: Placement) -> LinkLoad | ChordLoad:
         inertia = prepared.weight * placement.articulation.pseudo_inertia

@@ -143,15 +143,24 @@ class JointDamping(_Pull):
 @dataclass(frozen=True, eq=False)
 class Armature(_Pull):
     """Inertia of the rotors behind the joints, as MuJoCo's: added to the diagonal of the mass matrix. `inertia` `[*, nv]`
-    [kg m² or kg] ≥ 0; pulled to the integrator's target configuration as links are to their target poses."""
+    [kg m² or kg] ≥ 0; pulled to the integrator's target configuration as links are to their target poses. `length`: see
+    `shortened`."""
 
     inertia: Tensor
+    length: float = 1.0
 
     def __post_init__(self) -> None:
         require_non_negative("armature", self.inertia)
 
     def prepare(self, step: StepContext) -> PreparedPull:
-        return PreparedPull(self.inertia * step.weight[..., None], step.target_q)
+        a, start, target = step.previous.articulation, step.previous.q, step.target_q
+        if self.length < 1:
+            target = retract(a, start, self.length * difference(a, start, target))
+        return PreparedPull(self.inertia * step.weight[..., None] / self.length**2, target)
+
+    def shortened(self, share: float) -> Self:
+        """See `Inert`."""
+        return replaced(self, length=share * self.length)
 
     def take(self, worlds: Worlds) -> Self:
         """The same armature with the inertias of some worlds."""

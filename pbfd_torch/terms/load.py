@@ -169,6 +169,15 @@ class OneSided(Protocol):
 
 
 @runtime_checkable
+class Inert(Protocol):
+    """A term of inertial forces."""
+
+    def shortened(self, share: float) -> Term:
+        """The same term as a step has it that is `share` ≤ 1 times as long, and leads as far as it would by its speed."""
+        ...
+
+
+@runtime_checkable
 class Foreboding(Protocol):
     """A term with normal forces, for derivatives that are to know of contacts before they happen."""
 
