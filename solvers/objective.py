@@ -164,8 +164,8 @@ class Solution:
         return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
 
     def within(self, budget: int | Tensor | None, cost: int, index: Tensor | None = None) -> Tensor:
-        """Those of the worlds at `index` (None: the `unsolved` ones) that may spend `cost` evaluations more: their budget is a number
-        or `[*batch]`; None: they all may."""
+        """Those of the worlds at `index` (None: the `unsolved` ones) that may spend `cost` evaluations more: their budget is a
+        number or `[*batch]`; None: they all may."""
         index = self.unsolved if index is None else index
         if budget is None or len(index) == 0:
             return index
