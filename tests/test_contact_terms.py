@@ -156,6 +156,7 @@ def two_free() -> Articulation:
 
 
 ROUND, POLYTOPES, BALL_BOX, CURVED = ["RoundPairs"], ["PolytopePairs"], ["BallBoxPairs"], ["CurvedPairs"]
+CLOSEST = ["ClosestPairs"]
 BETWEEN: list[tuple[Shape, Shape, list[str]]] = [
     (BALL, BALL, ROUND),
     (BALL, Capsule(0.1, 0.2), ROUND),
@@ -165,7 +166,12 @@ BETWEEN: list[tuple[Shape, Shape, list[str]]] = [
     (Box((0.1, 0.1, 0.1)), Box((0.1, 0.1, 0.1)), POLYTOPES),
     (Capsule(0.1, 0.2), Box((0.1, 0.1, 0.1)), POLYTOPES),
     (HULL, BALL, POLYTOPES),
+    (BALL, Cylinder(0.1, 0.2), ["BallCylinderPairs"]),
+    (BALL, Ellipsoid((0.1, 0.2, 0.3)), CLOSEST),
+    (Capsule(0.1, 0.2), Ellipsoid((0.1, 0.2, 0.3)), CLOSEST),
+    (Ellipsoid((0.1, 0.2, 0.3)), Ellipsoid((0.1, 0.2, 0.3)), CLOSEST),
     (Cylinder(0.1, 0.2), Ellipsoid((0.1, 0.2, 0.3)), CURVED),
+    (Cylinder(0.1, 0.2), Box((0.1, 0.1, 0.1)), CURVED),
     (Point(), BALL, []),
     (Point(), Point(), []),
 ]
@@ -186,6 +192,8 @@ AGAINST: list[tuple[Shape, HalfSpace | Obstacle, str]] = [
     (BALL, Obstacle("o", HULL), "Contact"),
     (Capsule(0.1, 0.2), Obstacle("o", BALL), "RoundPairs"),
     (Box((0.1, 0.1, 0.1)), Obstacle("o", BALL), "BallBoxPairs"),
+    (Cylinder(0.1, 0.2), Obstacle("o", BALL), "BallCylinderPairs"),
+    (Ellipsoid((0.1, 0.2, 0.3)), Obstacle("o", BALL), "ClosestPairs"),
     (Capsule(0.1, 0.2), Obstacle("o", Box((1, 1, 1))), "PolytopePairs"),
     (HULL, Obstacle("o", Cylinder(0.1, 0.2)), "CurvedPairs"),
 ]

@@ -50,6 +50,13 @@ class Polytope:
     rim: Rim | None = None
 
     @property
+    def round(self) -> Rim | None:
+        """Of a shape that is the hull of balls or ellipsoids."""
+        if self.rim is not None or len(self.vertices) > 2:
+            return self.rim
+        return Rim((self.radius**2,) * 3, float(self.vertices[:, 2].max()))
+
+    @property
     def thickness(self) -> float:
         """The least distance [m] between two parallel planes that hold the rounded polytope between them."""
         along = self.vertices @ self.planes[:, :3].T

@@ -190,10 +190,11 @@ class PolytopePairs(Finder):
             surface=Plane(shaped(normal), shaped(offset)),
             dropped=shaped(dropped),
         )
-        return self._of_points(slots, shaped(points[rows]), shaped(spot))
+        return self._of_points(slots, found, points, plane, rows, spot)
 
-    def _of_points(self, slots: Slots, shape: Tensor, spot: Tensor) -> Slots:
-        """The slots with what else there is to say about their points."""
+    def _of_points(self, slots: Slots, found: Manifold, points: Tensor, plane: Tensor, rows: Tensor, spot: Tensor) -> Slots:
+        """The slots with what else there is to say about them: they hold the points `spot` of the `rows` of what was found, all
+        `[worlds, n]`; of the rows the shapes that give the points and the plane."""
         return slots
 
     def _empty(self, batch: tuple[int, ...]) -> Slots:
@@ -204,4 +205,8 @@ class PolytopePairs(Finder):
         position = zero[..., None].expand(*zero.shape, 3)
         first, second = number + self.body[self.first[:1]], number + self.body[self.second[:1]]
         slots = Slots(none, number, first, position, zero, second, Plane(up, zero), none[..., 0])
-        return self._of_points(slots, number, number)
+        return self._empty_points(slots)
+
+    def _empty_points(self, slots: Slots) -> Slots:
+        """Empty slots with what else there is to say about them."""
+        return slots

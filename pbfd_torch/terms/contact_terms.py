@@ -16,8 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.ball_box_pairs import BallBoxPairs
+from pbfd_torch.contact.ball_pairs import BallBoxPairs, BallCylinderPairs, BallPairs
 from pbfd_torch.contact.candidates import Finder
+from pbfd_torch.contact.closest import RoundShape
+from pbfd_torch.contact.closest_pairs import ClosestPairs
 from pbfd_torch.contact.curved_pairs import RIMS, CurvedPairs
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.hazards import Overflow
@@ -26,7 +28,7 @@ from pbfd_torch.contact.pairing import friction_between, touch
 from pbfd_torch.contact.polytope import polytope_of
 from pbfd_torch.contact.polytope_pairs import POINTS, PolytopePairs
 from pbfd_torch.contact.round_pairs import Round, RoundPairs
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Curved, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Curved, Cylinder, Point, Shape, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.terms.actuators import Actuators
@@ -104,6 +106,12 @@ class _Part:
         half = self.shape.half_length if isinstance(self.shape, Capsule) else 0.0
         ends = [tuple((self.frame[:3, 3] + z * self.frame[:3, 2]).tolist()) for z in (-half, half)]
         return Round(self.body, ends[0], ends[1], self.shape.radius)
+
+    @property
+    def rolling(self) -> RoundShape | None:
+        """As a round body without flat caps, if it is one."""
+        rim = polytope_of(self.shape).round
+        return None if rim is None or isinstance(self.shape, Cylinder) else RoundShape(rim, False, self.frame)
 
 
 class _Builder:
@@ -196,7 +204,7 @@ class _Builder:
             extent[part.body] = torch.maximum(extent[part.body], _extent(part))
         carriers = tuple(x.carrier(self.articulation.dtype, self.articulation.device) for x in solids)
         return [
-            (CurvedBodyContact if isinstance(finder, CurvedPairs) else BodyContact)(
+            (CurvedBodyContact if isinstance(finder, ClosestPairs | CurvedPairs) else BodyContact)(
                 finder=finder,
                 obstacles=carriers,
                 extent=extent.to(mu),
@@ -264,24 +272,28 @@ class _Builder:
     def _finders(self, parts: Sequence[_Part], pairs: Sequence[tuple[int, int]]) -> list[Finder]:
         like = torch.zeros((), dtype=self.articulation.dtype, device=self.articulation.device)
         rounds: list[tuple[int, Round, Round]] = []
-        balls: list[tuple[int, _Part, _Part]] = []
+        balls: dict[type[Shape], list[tuple[int, _Part, _Part]]] = {Box: [], Cylinder: []}
+        closest: list[tuple[int, tuple[int, RoundShape], tuple[int, RoundShape]]] = []
         others: list[tuple[int, int, int]] = []
         for k, (a, b) in enumerate(pairs):
             one, other = parts[a], parts[b]
             axes = one.axis, other.axis
             if axes[0] is not None and axes[1] is not None:
                 rounds.append((k, axes[0], axes[1]))
-            elif isinstance(one.shape, Sphere) and isinstance(other.shape, Box):
-                balls.append((k, one, other))
-            elif isinstance(other.shape, Sphere) and isinstance(one.shape, Box):
-                balls.append((k, other, one))
+            elif isinstance(one.shape, Sphere) and type(other.shape) in balls:
+                balls[type(other.shape)].append((k, one, other))
+            elif isinstance(other.shape, Sphere) and type(one.shape) in balls:
+                balls[type(one.shape)].append((k, other, one))
+            elif (first := one.rolling) is not None and (second := other.rolling) is not None:
+                closest.append((k, (one.body, first), (other.body, second)))
             else:
                 others.append((k, a, b))
         finders: list[Finder] = []
         if rounds:
             finders.append(RoundPairs.of(rounds, self._slots(3 * len(rounds)), like))
-        if balls:
-            finders.append(_ball_boxes(balls, self._slots(len(balls)), like))
+        finders += [_balls(some, self._slots(len(some)), like) for some in balls.values() if some]
+        if closest:
+            finders.append(ClosestPairs.of(closest, self._slots(len(closest)), like))
         if others:
             used = sorted({x for _, a, b in others for x in (a, b)})
             place = {x: k for k, x in enumerate(used)}
@@ -324,14 +336,19 @@ def _extent(part: _Part) -> Tensor:
     return (torch.linalg.vector_norm(places, dim=-1) + torch.from_numpy(np.asarray(radii))).max()
 
 
-def _ball_boxes(balls: Sequence[tuple[int, _Part, _Part]], slots: int, like: Tensor) -> BallBoxPairs:
-    return BallBoxPairs(
-        pair=indices([k for k, _, _ in balls], like.device),
-        first=indices([ball.body for _, ball, _ in balls], like.device),
-        second=indices([box.body for _, _, box in balls], like.device),
-        position=torch.stack([ball.frame[:3, 3] for _, ball, _ in balls]).to(like),
-        radius=like.new_tensor([ball.shape.radius for _, ball, _ in balls if isinstance(ball.shape, Sphere)]),
-        frame=torch.stack([box.frame[:3] for _, _, box in balls]).to(like),
-        half_extents=like.new_tensor([box.shape.half_extents for _, _, box in balls if isinstance(box.shape, Box)]),
-        slots=slots,
+def _balls(balls: Sequence[tuple[int, _Part, _Part]], slots: int, like: Tensor) -> BallPairs:
+    """Of spheres beside solids that are all boxes or all cylinders."""
+    solids = [solid.shape for _, _, solid in balls]
+    common = (
+        indices([k for k, _, _ in balls], like.device),
+        indices([ball.body for _, ball, _ in balls], like.device),
+        indices([solid.body for _, _, solid in balls], like.device),
+        torch.stack([ball.frame[:3, 3] for _, ball, _ in balls]).to(like),
+        like.new_tensor([ball.shape.radius for _, ball, _ in balls if isinstance(ball.shape, Sphere)]),
+        torch.stack([solid.frame[:3] for _, _, solid in balls]).to(like),
     )
+    if isinstance(solids[0], Box):
+        half = [x.half_extents for x in solids if isinstance(x, Box)]
+        return BallBoxPairs(*common, half_extents=like.new_tensor(half), slots=slots)
+    size = [(x.radius, x.half_length) for x in solids if isinstance(x, Cylinder)]
+    return BallCylinderPairs(*common, size=like.new_tensor(size), slots=slots)

@@ -1,4 +1,7 @@
-"""Contact between bodies of which one is a cylinder or an ellipsoid: the point that touches moves over it."""
+"""Contact between bodies of which one is a cylinder or an ellipsoid: the point that touches moves over it.
+
+It lies beside a plane of the other body, or, where two round bodies touch at one point, where they come closest.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from pbfd_torch.contact.curved_pairs import CurvedSlots
 from pbfd_torch.contact.surface import Placed
 from pbfd_torch.tensors.vectors import applied, mapped
 from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.terms.approaching import Approaching, closest_approach
 from pbfd_torch.terms.body_contact import BodyContact, PreparedBodyContact, of_slots
 from pbfd_torch.terms.load import StepContext
 from pbfd_torch.terms.lying import share_of
@@ -42,9 +46,14 @@ class CurvedBodyContact(BodyContact):
         return PreparedCurvedBodies(**fields, share=share)
 
     def _gaps(self, slots: Slots, bodies: Tensor) -> Tensor:
+        assert isinstance(slots, CurvedSlots)
         first, second = of_slots(bodies, slots.first), of_slots(bodies, slots.second)
         field = Placed(slots.surface, second).field(mapped(first, slots.position))
-        return field.distance - slots.radius - reaching(_form(slots, first), field.direction)
+        gap = field.distance - slots.radius - reaching(_form(slots, first), field.direction)
+        if slots.meeting is None:
+            return gap
+        found, _ = closest_approach(slots.meeting, torch.stack((first, second), -3), field.direction)
+        return torch.where(slots.meeting.follows, found.gap, gap)
 
     def pressing(self, prepared: PreparedBodyContact) -> NormalForce:
         """See `ContactLaws`."""
@@ -55,10 +64,17 @@ class CurvedBodyContact(BodyContact):
     def touching(self, prepared: PreparedBodyContact, placement: Placement) -> Supported:
         """See `ContactLaws`."""
         at, slots = super().touching(prepared, placement), prepared.slots
-        form = _form(slots, of_slots(prepared.standing(placement), slots.first))
+        assert isinstance(slots, CurvedSlots)
+        bodies = prepared.standing(placement)
+        first = of_slots(bodies, slots.first)
+        form = _form(slots, first)
         deep = dataclasses.replace(at, depth=at.depth + reaching(form, at.normal))
         balls = torch.diag_embed(slots.radius.square()[..., None].expand(*slots.radius.shape, 3))
-        return Supported.of(deep, form + balls)
+        planes = Supported.of(deep, form + balls)
+        if slots.meeting is None:
+            return planes
+        frames = torch.stack((first, of_slots(bodies, slots.second)), -3)
+        return Approaching.beside(planes, slots.meeting, frames, prepared.raised(torch.zeros_like(planes.depth)))
 
 
 def _form(slots: Slots, first: Tensor) -> Tensor:
