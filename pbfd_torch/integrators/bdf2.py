@@ -110,8 +110,8 @@ class Bdf2:
         return end, lambda: (push - state.push).abs() > self.jump
 
     def halves(self, objective: BalanceObjective, end: State, solved: Tensor) -> Tensor:
-        """None: an easier step is good enough."""
-        return torch.zeros_like(solved)
+        """Never: an easier step is good enough."""
+        return torch.zeros_like(solved, dtype=torch.int32)
 
     def resized(self, articulation: Articulation, state: FourPoses, dt: Tensor, new: Tensor) -> FourPoses:
         """A past of constant acceleration, that of the last two steps."""

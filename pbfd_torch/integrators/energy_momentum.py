@@ -45,6 +45,7 @@ from pbfd_torch.tree.kinematics import Chord, Motion, Placement, difference, pla
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
+PATIENCE = 3  # halvings
 SURPLUS, RESERVE = 1e-3, 1e-2  # of the largest kinetic energy so far: what steps may gain together, and what is kept of losses
 
 
@@ -170,11 +171,11 @@ class EnergyMomentum:
         return gain.end, refused
 
     def halves(self, objective: BalanceObjective, end: Velocities, solved: Tensor) -> Tensor:
-        """Where nothing pushes, nor would where inertia alone leads, and where nothing but its energy is wrong with the step: there
-        the energy that an easier step would take is worth two shorter ones."""
+        """Once where nothing pushes, nor would where inertia alone leads: there the energy that an easier step would take is worth
+        two shorter ones; and up to `PATIENCE` times where nothing but its energy is wrong with the step."""
         step = objective.step
         free = objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(end.q) == 0
-        return free | (solved & end.overdrawn)
+        return torch.where(solved & end.overdrawn, PATIENCE, free.to(torch.int32))
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""

@@ -92,8 +92,8 @@ class ImplicitEuler:
         return end, functools.partial(objective.strayed, q)
 
     def halves(self, objective: BalanceObjective, end: State, solved: Tensor) -> Tensor:
-        """None: an easier step is good enough."""
-        return torch.zeros_like(solved)
+        """Never: an easier step is good enough."""
+        return torch.zeros_like(solved, dtype=torch.int32)
 
     def resized(self, articulation: Articulation, state: Positions, dt: Tensor, new: Tensor) -> Positions:
         """See `Integrator`."""

@@ -124,8 +124,8 @@ class Integrator(Protocol[S]):
         ...
 
     def halves(self, objective: BalanceObjective, end: S, solved: Tensor) -> Tensor:
-        """Worlds `[*batch]` that had better take two shorter steps than an easier one, if that which ended like this is unsolved or
-        refused; solved: which were, before they were refused."""
+        """How often a world had better halve its step before it takes an easier one, `[*batch]` int, if that which ended like this
+        is unsolved or refused; solved: which were, before they were refused."""
         ...
 
     def resized(self, articulation: Articulation, state: S, dt: Tensor, new: Tensor) -> S:

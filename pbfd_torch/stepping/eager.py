@@ -196,11 +196,17 @@ class EagerStepper(Generic[S]):
             advanced, _ = self.integrator.advance(objective, state, solution.q)  # what is refused still has found nothing better
         q = solution.q
         detours: list[Detour] = []
-        if easier and self._may_halve(1):
-            index = index[self.integrator.halves(objective, advanced, arrived).reshape(-1)[index]]
-            if len(index := self._halvable(solution, index, 2)):
-                advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2)
-                detours.append(detour)
+        wanted = self.integrator.halves(objective, advanced, arrived).reshape(-1) if easier else None
+        for halvings in range(1, self.halvings + 1):
+            if wanted is None or not self._may_halve(halvings):
+                break
+            index = self._halvable(solution, solution.unsolved[wanted[solution.unsolved] >= halvings], 2**halvings)
+            if len(index) == 0:
+                break
+            # as long as still shorter steps are to be tried, none of these may be an easier one
+            easy = wanted[index] == halvings
+            advanced, solution, detour = self._halved(state, control, advanced, solution, index, 2**halvings, easy)
+            detours.append(detour)
         for k, scheme in enumerate(easier):
             # detours for the last one only: what comes before is tried for its accuracy
             solver = self.solver if k == len(easier) - 1 else self.first_solver
@@ -260,10 +266,18 @@ class EagerStepper(Generic[S]):
         return put(advanced, eased, worlds, kept), result, Detour(worlds, kept, easier, (Way(found.q),))
 
     def _halved(
-        self, state: S, control: Tensor | None, advanced: S, solution: Solution, index: Tensor, parts: int
+        self,
+        state: S,
+        control: Tensor | None,
+        advanced: S,
+        solution: Solution,
+        index: Tensor,
+        parts: int,
+        easy: Tensor | None = None,
     ) -> tuple[S, Solution, Detour]:
         """The step of the worlds at `index` again, as `parts` shorter ones; a world keeps the result if all of them solve. It then
-        goes on with the velocity of the last one."""
+        goes on with the velocity of the last one. easy: `[n]` bool, in which worlds these may be steps of another integrator; None:
+        in all."""
         worlds = Worlds(state.q.shape[:-1], index)
         part = self.take(worlds)
         left = (self._budget(index) - solution.evaluations.reshape(-1)[index]) // parts
@@ -281,6 +295,8 @@ class EagerStepper(Generic[S]):
         now = replaced(now, hazards=hazards)
         end = self.integrator.resized(short.articulation, now, short.step_size, part.step_size)
         solved = torch.stack([x.solved for x in climbs]).all(0)
+        if easy is not None:
+            solved = solved & (easy | torch.stack([x.status != int(Status.EASED) for x in climbs]).all(0))
         worst = torch.stack([x.residual_norm for x in climbs]).amax(0)
         failed = torch.where(solved, climbs[-1].status, int(Status.STALLED))
         # an unfinished chain of short steps is no better end of the whole step, whatever its own residual
