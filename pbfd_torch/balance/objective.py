@@ -180,8 +180,7 @@ class BalanceObjective:
         watching = any(isinstance(term, Hazardous) for term in self.terms)
         if not watching and not any(x.numel() for x in self.memory):
             return Aftermath(self.memory, hazards)
-        before, now = (x.poses[..., :3, :3] for x in (self.step.previous, placement))
-        turned = (before * now).sum((-2, -1)) < 1  # the trace of the rotation between them is 1 + 2 cos of its angle
+        turned = self.turned(placement)
         memory = []
         for term, prepared in zip(self.terms, self.prepared, strict=True):
             if isinstance(term, Remembering):
@@ -189,6 +188,11 @@ class BalanceObjective:
             if isinstance(term, Hazardous):
                 hazards = hazards | term.hazards(prepared, placement, turned)
         return Aftermath(tuple(memory), hazards)
+
+    def turned(self, placement: Placement) -> Tensor:
+        """The links that have turned by more than a quarter turn in a step that ended at a placement, `[*batch, nlink]` bool."""
+        before, now = (x.poses[..., :3, :3] for x in (self.step.previous, placement))
+        return (before * now).sum((-2, -1)) < 1  # the trace of the rotation between them is 1 + 2 cos of its angle
 
     def forces(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Everything but inertia at the end of a step: what contacts and limits do, and the rest, each `[*batch, nv]`."""

@@ -131,10 +131,10 @@ class Recorder(Records):
     def _suspect(self, state: State, objective: BalanceObjective, placement: Placement) -> Tensor:
         """Of the worlds whose step has a hazard what is deepest beyond its measure, `[*batch]`; see `Rollout`."""
         none = torch.full_like(state.hazards, -1)
-        shares, numbers, count = [], [], 0
+        shares, numbers, count, turned = [], [], 0, objective.turned(placement)
         for term, prepared in zip(objective.terms, objective.prepared, strict=True):
             if isinstance(term, Hazardous):
-                share, number = term.strain(prepared, placement)
+                share, number = term.strain(prepared, placement, turned)
                 shares.append(share)
                 numbers.append(number + count)
                 count += len(term.dangers(objective.articulation))

@@ -124,10 +124,11 @@ class ContactLaws(ABC, Generic[P]):
     def numbers(self, prepared: P) -> Tensor:
         """The place of each candidate among `pairs`, `[*batch, n]` or `[n]`."""
 
-    def strain(self, prepared: P, placement: Placement) -> tuple[Tensor, Tensor]:
+    def strain(self, prepared: P, placement: Placement, turned: Tensor) -> tuple[Tensor, Tensor]:
         """See `Hazardous`."""
         depth = self.depths(prepared, placement)
         share = torch.zeros_like(depth) if prepared.deep is None else depth / prepared.deep
+        share = share + ((depth > 0) & self.carried(prepared, turned))
         return share, self.numbers(prepared).expand(depth.shape)
 
     def prepare(self, step: StepContext) -> P:

@@ -108,14 +108,14 @@ class JointLimits:
 
     def hazards(self, prepared: PreparedLimits, placement: Placement, turned: Tensor) -> Tensor:
         """See `Hazardous`."""
-        share, _ = self.strain(prepared, placement)
+        share, _ = self.strain(prepared, placement, turned)
         return marked({Hazard.TOO_DEEP: (share > 1).any(-1)})
 
     def dangers(self, articulation: Articulation) -> tuple[str, ...]:
         """See `Hazardous`."""
         return tuple(f"limit of {articulation.joint_names[j]}" for j in articulation.topology.dof_joints)
 
-    def strain(self, prepared: PreparedLimits, placement: Placement) -> tuple[Tensor, Tensor]:
+    def strain(self, prepared: PreparedLimits, placement: Placement, turned: Tensor) -> tuple[Tensor, Tensor]:
         """See `Hazardous`."""
         past = torch.stack(_depths(placement)).amax(0)
         return past / TOO_FAR, torch.arange(past.shape[-1], device=past.device).expand(past.shape)

@@ -238,9 +238,9 @@ class Hazardous(Protocol):
         """Names of what may be in danger."""
         ...
 
-    def strain(self, prepared: Any, placement: Placement) -> tuple[Tensor, Tensor]:
-        """How deep everything is at a placement that ends the prepared step, as a share of the depth that is a hazard, and its
-        place among `dangers`, `[*batch, n]` each."""
+    def strain(self, prepared: Any, placement: Placement, turned: Tensor) -> tuple[Tensor, Tensor]:
+        """How deep everything is at a placement that ends the prepared step, as a share of the depth that is a hazard, one more
+        where it touches a link that has turned far; and its place among `dangers`; `[*batch, n]` each."""
         ...
 
 
