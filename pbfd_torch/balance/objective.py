@@ -180,19 +180,21 @@ class BalanceObjective:
         watching = any(isinstance(term, Hazardous) for term in self.terms)
         if not watching and not any(x.numel() for x in self.memory):
             return Aftermath(self.memory, hazards)
-        turned = self.turned(placement)
+        with torch.no_grad():  # hazards do not change smoothly
+            turned = self.turned(placement)
         memory = []
         for term, prepared in zip(self.terms, self.prepared, strict=True):
             if isinstance(term, Remembering):
                 memory.append(term.remembered(prepared, placement))
             if isinstance(term, Hazardous):
-                hazards = hazards | term.hazards(prepared, placement, turned)
+                with torch.no_grad():
+                    hazards = hazards | term.hazards(prepared, placement, turned)
         return Aftermath(tuple(memory), hazards)
 
-    def turned(self, placement: Placement) -> Tensor:
-        """The links that have turned by more than a quarter turn in a step that ended at a placement, `[*batch, nlink]` bool."""
+    def turned(self, placement: Placement, angle: float = FARTHEST) -> Tensor:
+        """The links that have turned by more than an angle [rad] in a step that ended at a placement, `[*batch, nlink]` bool."""
         before, now = (x.poses[..., :3, :3] for x in (self.step.previous, placement))
-        return (before * now).sum((-2, -1)) < 1  # the trace of the rotation between them is 1 + 2 cos of its angle
+        return (before * now).sum((-2, -1)) < 1 + 2 * math.cos(angle)  # the trace of the rotation between them
 
     def forces(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Everything but inertia at the end of a step: what contacts and limits do, and the rest, each `[*batch, nv]`."""

@@ -45,7 +45,8 @@ from pbfd_torch.tree.kinematics import Chord, Motion, Placement, difference, pla
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
-PATIENCE = 3  # halvings
+NOISE = 1e-5  # of the same: less is no gain
+PATIENCE, FAST = 3, 0.3  # halvings of steps in which a link turns by so much [rad]
 SURPLUS, RESERVE = 1e-3, 1e-2  # of the largest kinetic energy so far: what steps may gain together, and what is kept of losses
 
 
@@ -59,6 +60,7 @@ class Velocities(State):
     lag: twice what v is short by besides, `[*batch, nv]`: what forces of another weight take from the loads with θ > ½, 2θ − 1 of
         their impulse.
     average: velocity over that step, `[*batch, nv]`: with it the next step's solution is guessed.
+    gained: energy [J] `[*batch]` that the last step has gained beyond the work done on the bodies.
     surplus: energy [J] `[*batch]` that all steps together have gained beyond the work done on the bodies. What they have lost makes
         up for it, but for no more than `RESERVE`: what an impact takes is gone.
     peak: the largest kinetic energy so far [J] `[*batch]`, that of a fall over one step included.
@@ -69,13 +71,14 @@ class Velocities(State):
     steady: Tensor
     lag: Tensor
     average: Tensor
+    gained: Tensor
     surplus: Tensor
     peak: Tensor
 
     @property
     def overdrawn(self) -> Tensor:
-        """Where more energy has been gained than may be, `[*batch]` bool."""
-        return self.surplus > SURPLUS * self.peak
+        """Where the last step has brought more energy than all may have gained, `[*batch]` bool."""
+        return (self.surplus > SURPLUS * self.peak) & (self.gained > NOISE * self.peak)
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,9 @@ class EnergyMomentum:
         before."""
         trial, dt = starter.trial(q, v, control), starter.step_size
         nothing, zero = torch.zeros_like(v), torch.zeros_like(q[..., 0])
-        begin = Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v, surplus=zero, peak=zero)
+        begin = Velocities(
+            **fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v, gained=zero, surplus=zero, peak=zero
+        )
         objective = starter.objective(begin, control)
         forces = _Forces(objective, place(starter.articulation, trial.end))
         at = objective.step.previous
@@ -165,17 +170,18 @@ class EnergyMomentum:
             if suspect.device.type != "cpu" or bool(suspect.numpy().any()):
                 spurious = dt * (objective.evaluate(q).residual * average).sum(-1)
                 excess = gain.energy - spurious > EXCESS * gain.kinetic
-                overdrawn = replaced(gain.end, surplus=gain.end.surplus - spurious).overdrawn
+                overdrawn = replaced(gain.end, surplus=gain.end.surplus - spurious, gained=gain.energy - spurious).overdrawn
             return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn | objective.strayed(q)
 
         return gain.end, refused
 
     def halves(self, objective: BalanceObjective, end: Velocities, solved: Tensor) -> Tensor:
         """Once where nothing pushes, nor would where inertia alone leads: there the energy that an easier step would take is worth
-        two shorter ones; and up to `PATIENCE` times where nothing but its energy is wrong with the step."""
+        two shorter ones; and up to `PATIENCE` times where nothing but its energy is wrong with the step and it turns fast."""
         step = objective.step
         free = objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(end.q) == 0
-        return torch.where(solved & end.overdrawn, PATIENCE, free.to(torch.int32))
+        fast = objective.turned(place(objective.articulation, end.q), FAST).any(-1)
+        return torch.where(solved & end.overdrawn & fast, PATIENCE, free.to(torch.int32))
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""
@@ -228,7 +234,7 @@ class _Gain:
             self.energy, self.kinetic = last - first - lost - work, first + last + fall(objective)
             peak = torch.maximum(state.peak, torch.maximum(first, last) + fall(objective))
             surplus = torch.maximum(state.surplus + self.energy, -RESERVE * peak)
-        self.end = replaced(end, surplus=surplus, peak=peak)
+        self.end = replaced(end, gained=self.energy, surplus=surplus, peak=peak)
 
 
 class _Forces:
@@ -283,6 +289,7 @@ def _ended(
         steady=share * push,
         lag=lag,
         average=average,
+        gained=state.gained,
         surplus=state.surplus,
         peak=state.peak,
     )
