@@ -6,8 +6,10 @@ line.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +17,9 @@ from torch import Tensor
 
 from pbfd_torch import Simulator
 from pbfd_torch.gradients.parameters import parameters, with_parameters
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.integrator import Integrator
+from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -31,6 +35,9 @@ FLOOR = 1e-3  # the end is of the size of 1, and so are its largest derivatives
 FORMS = (".form", ".axis")  # of curved candidates: those among them that are points have none to be differentiated by
 SHARED = (".normals", ".offsets", ".starts", ".ends", ".coefficients", ".origin", ".spacing")
 PRECISE = 1e-13  # of the weight: differences see the solver's tolerance
+
+# what depends on the energy gained so far would jump within the differences
+SMOOTH: dict[str, Callable[[], Integrator[Any]]] = {**INTEGRATORS, "energy-momentum": partial(EnergyMomentum, math.inf)}
 
 
 def kind(name: str) -> str:

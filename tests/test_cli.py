@@ -23,7 +23,7 @@ from tests.gymnasium_files import gymnasium_file
 pbfd = pytest.fixture(caller)
 INFO_KEYS = {
     *("name", "nq", "nv", "nu", "mass_kg", "gravity_m_s2", "links", "joints"),
-    *("actuators", "obstacles", "keyframes", "terms", "not_modelled"),
+    *("actuators", "unlimited_actuators", "obstacles", "keyframes", "terms", "not_modelled"),
 }
 
 
@@ -47,6 +47,7 @@ def test_info_of_a_shipped_robot(pbfd: Pbfd) -> None:
     assert (foot["armature"], foot["damping"]) == (1, 1)
     assert data["obstacles"] == [{"name": "floor", "shape": "HalfSpace", "normal": [0, 0, 1], "offset_m": 0}]
     assert data["actuators"] == ["thigh", "leg", "foot"]
+    assert data["unlimited_actuators"] == []
 
     ran = pbfd("info", "hopper")
     assert ran.status == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Collider, ConvexHull, Cylinder, Ellipsoid, Shape, Sphere
 from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -57,7 +59,13 @@ def body_on(shape: Shape, floor: HalfSpace | Obstacle, slope: float = 0.0, mass:
 
 
 def rolled(
-    scene: Scene, dt: float, duration: float, height: float, turn: tuple[float, ...] = UPRIGHT, speed: float = 0.0
+    scene: Scene,
+    dt: float,
+    duration: float,
+    height: float,
+    turn: tuple[float, ...] = UPRIGHT,
+    speed: float = 0.0,
+    integrator: Integrator[Any] | None = None,
 ) -> Rollout:
     """From a place at a height, at `speed` along x and rolling."""
     q = torch.zeros(1, 7, dtype=torch.float64)
@@ -66,7 +74,7 @@ def rolled(
     v = torch.zeros(1, 6, dtype=torch.float64)
     v[0, 0] = speed
     v[0, 3:] = quaternion_matrix(q[0, 3:]).T @ torch.tensor([0.0, speed / R, 0.0], dtype=torch.float64)
-    simulator = Simulator(scene, dt)
+    simulator = Simulator(scene, dt, integrator)
     return simulator.rollout(simulator.initial_state(q, v), steps=round(duration / dt))
 
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from pbfd_torch.integrators.integrator import Integrator
-from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -18,7 +17,7 @@ from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.static_friction import StaticFriction
 from pbfd_torch.tree.kinematics import difference
-from tests.gradient_checks import Experiment, compared
+from tests.gradient_checks import SMOOTH, Experiment, compared
 from tests.term_cases import ROUND, TERMS, Situation, TermCase, contact, dry_torque, situation
 
 # differences need laws that are smooth over what they move by: the steep ones of TERMS over a centimetre a second
@@ -72,7 +71,7 @@ def experiment(case: TermCase, integrator: Callable[[], Integrator[Any]]) -> Exp
 
 PAIRS = [
     pytest.param(case, name, id=f"{case}, {name}")
-    for name in INTEGRATORS
+    for name in SMOOTH
     for case in CASES
     if name == "energy-momentum" or case.name in (*FEW, "armature", "actuators")
 ]
@@ -82,7 +81,7 @@ PAIRS = [
 def test_two_steps_from_a_start(case: TermCase, name: str) -> None:
     """Configuration, velocity, control, dt, gravity, and every number of the articulation and the term: ≤ 1e-7 of central
     differences, relative."""
-    found = compared(experiment(case, INTEGRATORS[name]))
+    found = compared(experiment(case, SMOOTH[name]))
     assert {"q", "v", "dt", "gravity", "articulation.pseudo_inertia", "articulation.joint_frame"} <= set(found)
     wrong = {n: (f.implicit, f.differences) for n, f in found.items() if not (f.same and f.error <= 1e-7)}
     assert not wrong
@@ -91,7 +90,7 @@ def test_two_steps_from_a_start(case: TermCase, name: str) -> None:
 def test_differences_shrink_with_the_square_of_their_step() -> None:
     """What central differences are off by falls by 4 as they halve, until rounding: the implicit derivative is their limit."""
     case = next(case for case in CASES if case.name == "Coulomb, sticking, rolling")
-    given = experiment(case, INTEGRATORS["energy-momentum"])
+    given = experiment(case, SMOOTH["energy-momentum"])
     directions = given.directions()
     for name in ("q", "v", "articulation.pseudo_inertia", "terms.1.friction.mu", "dt"):
         exact = compared(given, names=(name,))[name].implicit

@@ -16,11 +16,10 @@ from pbfd_torch.contact.motion import Conveyor, Lift, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, Shape, Sphere
 from pbfd_torch.gradients.parameters import parameters, with_parameters
-from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.normal_force import NormalForce
-from tests.gradient_checks import Experiment, compared
+from tests.gradient_checks import SMOOTH, Experiment, compared
 from tests.random_trees import generator
 from tests.test_obstacle_physics import TOPS, on
 from tests.touching_bodies import Pose, free_bodies, posed
@@ -47,7 +46,7 @@ def thrown(obstacle: Obstacle | HalfSpace, shape: Shape, friction: CoulombFricti
     depth = {Sphere: 0.1, Box: 0.05, Capsule: 0.1, Cylinder: 0.055, Ellipsoid: 0.08}[type(shape)]
     q = posed((0.02, 0.01, depth - 2e-3, 0.05, 0.02, 0.1))[0]
     v = torch.tensor([0.5, 0.2, -0.1, 0.3, -0.2, 0.4], dtype=torch.float64)
-    return Experiment(scene, 0.01, INTEGRATORS["energy-momentum"], q, v)
+    return Experiment(scene, 0.01, SMOOTH["energy-momentum"], q, v)
 
 
 @pytest.mark.parametrize("solid", TOPS)
@@ -150,7 +149,7 @@ def test_bodies_that_meet(name: str, integrator: str) -> None:
     v = torch.tensor([0.0] * 6 + [0.1, 0.05, -0.3, 0.2, 0.1, 0.3], dtype=torch.float64)
     scene = free_bodies(shapes, [1.0, 0.7])
     soft = {x: torch.tensor(1e6, dtype=torch.float64) for x in parameters(scene) if x.endswith("force.stiffness")}
-    experiment = Experiment(with_parameters(scene, soft), 0.01, INTEGRATORS[integrator], posed(*poses)[0], v)
+    experiment = Experiment(with_parameters(scene, soft), 0.01, SMOOTH[integrator], posed(*poses)[0], v)
     found = compared(
         experiment, largest=1e-3, names=tuple(x for x in experiment.values if x in BOTH or x.endswith((".mu", "force.stiffness")))
     )

@@ -14,7 +14,6 @@ from pbfd_torch import Simulator
 from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.parameters import parameters, with_parameters
-from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES
 from pbfd_torch.scene import Scene
 from pbfd_torch.tensors.structures import tensors_of
@@ -28,12 +27,12 @@ from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.tree.kinematics import difference
 from tests.bodies import GRAVITY, diagonal
 from tests.finite_differences import derivative
-from tests.gradient_checks import precise_solver
+from tests.gradient_checks import SMOOTH, precise_solver
 from tests.random_trees import generator
 from tests.sliding_box import stopped
 from tests.touching_bodies import free_bodies, posed
 
-all_integrators = pytest.mark.parametrize("name", INTEGRATORS)
+all_integrators = pytest.mark.parametrize("name", SMOOTH)
 
 
 def number(value: float) -> Tensor:
@@ -109,7 +108,7 @@ def test_long_horizon() -> None:
     """A thousand steps of a spinning body that touches nothing: the derivative of where it ends by its velocity grows with time as
     it should, linearly along the motion, and stays below a hundred times that."""
     setup = SCENES["dzhanibekov"]()
-    simulator = Simulator(setup.scene, 0.01, INTEGRATORS["variational"]())
+    simulator = Simulator(setup.scene, 0.01, SMOOTH["variational"]())
     v = setup.v.clone().requires_grad_()
     path = simulator.trajectory(simulator.initial_state(setup.q, v), steps=1000)
     (by_v,) = torch.autograd.grad(path.q[-1, 0, :3].sum(), v)
@@ -128,11 +127,11 @@ def test_values_are_the_same_to_the_bit(name: str) -> None:
     and its friction, with checkpoints and without."""
     setup = SCENES["chain-slope-drop"](worlds=2)
     v = setup.v + torch.tensor([[0.0], [0.3]], dtype=torch.float64)
-    plain = Simulator(setup.scene, 0.05, INTEGRATORS[name]())
+    plain = Simulator(setup.scene, 0.05, SMOOTH[name]())
     expected = plain.trajectory(plain.initial_state(setup.q, v), steps=9)
     names = ("articulation.pseudo_inertia", "terms.1.friction.mu")
     values = {n: x.clone().requires_grad_() for n, x in parameters(setup.scene).items() if n in names}
-    simulator = Simulator(with_parameters(setup.scene, values), 0.05, INTEGRATORS[name]())
+    simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name]())
     gradients = []
     for checkpoint in (1, 4):
         given = v.clone().requires_grad_()
@@ -166,7 +165,7 @@ def test_forward_and_backward_agree(name: str) -> None:
 
     def end(v: Tensor, mu: Tensor) -> Tensor:
         scene = with_parameters(setup.scene, {"terms.1.friction.mu": mu})
-        simulator = Simulator(scene, 0.05, INTEGRATORS[name]())
+        simulator = Simulator(scene, 0.05, SMOOTH[name]())
         return simulator.trajectory(simulator.initial_state(setup.q, v), steps=6).q[-1].square().sum()
 
     mu, step = number(0.3), number(0.7)
@@ -209,7 +208,7 @@ def test_kept_factors_give_the_same() -> None:
     setup = SCENES["chain-slope-drop"]()
     found = []
     for keep in (False, True):
-        simulator = Simulator(setup.scene, 0.05, INTEGRATORS["implicit-euler"](), gradients=Gradients(keep_factors=keep))
+        simulator = Simulator(setup.scene, 0.05, SMOOTH["implicit-euler"](), gradients=Gradients(keep_factors=keep))
         v = setup.v.clone().requires_grad_()
         path = simulator.trajectory(simulator.initial_state(setup.q, v), steps=4)
         found += [torch.autograd.grad(path.q[-1, 0, k], v, retain_graph=True)[0] for k in (0, 2, 0)]

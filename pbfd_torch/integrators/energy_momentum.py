@@ -31,6 +31,7 @@ from pbfd_torch.balance.dynamics import (
     rotor_energy,
 )
 from pbfd_torch.balance.objective import BalanceObjective
+from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
 from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fall, fresh
@@ -47,7 +48,7 @@ FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
 NOISE = 1e-5  # of the same: less is no gain
 PATIENCE, FAST = 3, 0.3  # halvings of steps in which a link turns by so much [rad]
-SURPLUS, RESERVE = 1e-3, 1e-2  # of the largest kinetic energy so far: what steps may gain together, and what is kept of losses
+RESERVE = 1e-2  # of the largest kinetic energy so far: what is kept of losses
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,22 +76,30 @@ class Velocities(State):
     surplus: Tensor
     peak: Tensor
 
-    @property
-    def overdrawn(self) -> Tensor:
-        """Where the last step has brought more energy than all may have gained, `[*batch]` bool."""
-        return (self.surplus > SURPLUS * self.peak) & (self.gained > NOISE * self.peak)
-
 
 @dataclass(frozen=True)
 class EnergyMomentum:
     """κ = 1/Δt², T̂ = T_n + Δt V_n + ½Δt² [0 | g], share ½. The step is refused where a link has turned so far that the chord knows
     little of its rotation (virtual work vanishes there, and so does the residual, whatever the forces), and where contacts have
-    done more work than they can: in it, or in all steps together."""
+    done more work than they can: in it, or in all steps together.
+
+    `surplus`: > 0, of the largest kinetic energy so far, what all steps together may gain. Infinite: anything, and motions that
+    are close to each other are stepped alike, which derivatives like. Raises `InputError` for others."""
+
+    surplus: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.surplus > 0:
+            raise InputError(f"surplus is {self.surplus}: must be > 0, or infinite for steps that may gain anything")
+
+    def _overdrawn(self, end: Velocities) -> Tensor:
+        """Where a step has brought more energy than all together may have gained, `[*batch]` bool."""
+        return (end.surplus > self.surplus * end.peak) & (end.gained > NOISE * end.peak)
 
     @property
     def easier(self) -> Sequence[Integrator[Velocities]]:
         """The paper's step."""
-        return (_PaperStep(),)
+        return (_PaperStep(self.surplus),)
 
     @property
     def coordinates(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -163,14 +172,15 @@ class EnergyMomentum:
         def refused() -> Tensor:
             flat = torch.linalg.det(Chord(step.previous, now, torch.full_like(state.time, 0.5)).poses[..., :3, :3]).amin(-1)
             turned = objective.turn(dt[..., None] * average)
-            excess, overdrawn = gain.energy > EXCESS * gain.kinetic, gain.end.overdrawn
+            excess, overdrawn = gain.energy > EXCESS * gain.kinetic, self._overdrawn(gain.end)
             # what rounding has left of the residual works too: in float32 stiff friction is off by a share of the weight
             suspect = excess | overdrawn
             # what is in the host's own memory it may look at; asking a device would make it wait
             if suspect.device.type != "cpu" or bool(suspect.numpy().any()):
                 spurious = dt * (objective.evaluate(q).residual * average).sum(-1)
                 excess = gain.energy - spurious > EXCESS * gain.kinetic
-                overdrawn = replaced(gain.end, surplus=gain.end.surplus - spurious, gained=gain.energy - spurious).overdrawn
+                less = replaced(gain.end, surplus=gain.end.surplus - spurious, gained=gain.energy - spurious)
+                overdrawn = self._overdrawn(less)
             return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn | objective.strayed(q)
 
         return gain.end, refused
@@ -181,7 +191,7 @@ class EnergyMomentum:
         step = objective.step
         free = objective.push(step.previous.q) + objective.push(step.target_q) + objective.push(end.q) == 0
         fast = objective.turned(place(objective.articulation, end.q), FAST).any(-1)
-        return torch.where(solved & end.overdrawn & fast, PATIENCE, free.to(torch.int32))
+        return torch.where(solved & self._overdrawn(end) & fast, PATIENCE, free.to(torch.int32))
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""

@@ -231,8 +231,9 @@ class EagerStepper(Generic[S]):
         """Which of these worlds can afford the first attempt at each of so many shorter steps."""
         return solution.within(self.evaluations, parts * _attempt_of(self.first_solver), index)
 
-    def _budget(self, index: Tensor) -> int | Tensor:
-        return self.evaluations.reshape(-1)[index] if isinstance(self.evaluations, Tensor) else self.evaluations
+    def _left(self, solution: Solution, worlds: Worlds) -> Tensor:
+        """Evaluations that these worlds may spend yet."""
+        return worlds.rows(self.evaluations - solution.evaluations)
 
     def _may_halve(self, times: int) -> bool:
         return times <= self.halvings and self.dt / 2**times >= SHORTEST_STEP
@@ -254,8 +255,7 @@ class EagerStepper(Generic[S]):
         other = part.with_scheme(easier, solver, 0, part.step_size)
         before, held = state.take(worlds), None if control is None else worlds.pick(control, 1)
         objective = other.objective(before, held)
-        left = self._budget(index) - solution.evaluations.reshape(-1)[index]
-        budgeted = {"budget": left} if isinstance(solver, Fallbacks) else {}
+        budgeted = {"budget": self._left(solution, worlds)} if isinstance(solver, Fallbacks) else {}
         found = solver.solve(objective, objective.guess, before.q, **budgeted)
         lost = torch.where(solution.solved, solution.residual_norm, math.inf)
         result = merged(
@@ -280,7 +280,7 @@ class EagerStepper(Generic[S]):
         in all."""
         worlds = Worlds(state.q.shape[:-1], index)
         part = self.take(worlds)
-        left = (self._budget(index) - solution.evaluations.reshape(-1)[index]) // parts
+        left = (self._left(solution, worlds) // parts).to(torch.int32)
         short = part.with_scheme(self.integrator, self.solver, 0, part.step_size / parts).changed(evaluations=left)
         now = self.integrator.resized(short.articulation, state.take(worlds), part.step_size, short.step_size)
         held = None if control is None else worlds.pick(control, 1)
