@@ -123,7 +123,7 @@ class Following:
 
 WIDTHS = Continuation(((1000.0, 1.0), (100.0, 1.0), (10.0, 1.0)))
 STIFFNESSES = Continuation(((1.0, 1e-3), (1.0, 1e-2), (1.0, 1e-1)), tolerance=1e-2)
-SOON = 40  # evaluations
+SOON, LONG = 40, 60  # evaluations
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,13 @@ class Fallbacks:
 
 
 def doubted(objective: Relaxable, solution: Solution) -> Solution:
-    """The solution with worlds unsolved whose roots have strayed."""
-    return replaced(solution, solution.solved & objective.strayed(solution.q), Status.STALLED)
+    """The solution with worlds unsolved whose roots have strayed, and were found after a long search only: what a few of Newton's
+    steps lead to is where the motion goes."""
+    long = solution.solved & (solution.evaluations > LONG)
+    # what is in the host's own memory it may look at; asking a device would make it wait
+    if long.device.type == "cpu" and not bool(long.numpy().any()):
+        return solution
+    return replaced(solution, long & objective.strayed(solution.q), Status.STALLED)
 
 
 def replaced(solution: Solution, where: Tensor, status: Status) -> Solution:

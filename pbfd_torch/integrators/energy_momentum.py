@@ -46,7 +46,7 @@ from pbfd_torch.tree.kinematics import Chord, Motion, Placement, difference, pla
 FLATTEST = 0.3  # of cos²(φ/2), φ what a link turns by in a step: 2 rad
 FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
-NOISE = 1e-5  # of the same: less is no gain
+NOISE = 1e-4  # of the same: less in one step is never refused
 PATIENCE, FAST = 3, 0.3  # halvings of steps in which a link turns by so much [rad]
 RESERVE = 1e-2  # of the largest kinetic energy so far: what is kept of losses
 
@@ -181,7 +181,7 @@ class EnergyMomentum:
                 excess = gain.energy - spurious > EXCESS * gain.kinetic
                 less = replaced(gain.end, surplus=gain.end.surplus - spurious, gained=gain.energy - spurious)
                 overdrawn = self._overdrawn(less)
-            return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn | objective.strayed(q)
+            return (flat < FLATTEST) | (turned > FARTHEST) | excess | overdrawn
 
         return gain.end, refused
 

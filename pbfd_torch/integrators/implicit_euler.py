@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fresh
+from pbfd_torch.integrators.integrator import Integrator, Starter, State, after, calm, fresh
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import StepContext, Term
 from pbfd_torch.tree.articulation import Articulation
@@ -82,14 +81,13 @@ class ImplicitEuler:
             gravity=gravity,
         )
 
-    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, Refusal]:
+    def advance(self, objective: BalanceObjective, state: Positions, q: Tensor) -> tuple[Positions, None]:
         """See `Integrator`."""
         a, h = objective.articulation, objective.step.dt[..., None]
         gained = difference(a, state.q, q) / h - self.velocity(a, state, objective.step.dt)
         smooth = calm(objective, objective.step.previous, gained)[..., None]
         acceleration = torch.where(smooth, gained / h, 0.0)
-        end = Positions(**after(objective, place(a, q)), q_previous=state.q, acceleration=acceleration)
-        return end, functools.partial(objective.strayed, q)
+        return Positions(**after(objective, place(a, q)), q_previous=state.q, acceleration=acceleration), None
 
     def halves(self, objective: BalanceObjective, end: State, solved: Tensor) -> Tensor:
         """Never: an easier step is good enough."""

@@ -19,7 +19,7 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
-from pbfd_torch.solvers.fallbacks import Fallbacks, merged
+from pbfd_torch.solvers.fallbacks import Fallbacks, doubted, merged
 from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
@@ -183,6 +183,8 @@ class EagerStepper(Generic[S]):
         """The rest of a step that the first solver has left at `solution`, from which the integrator would go on to `advanced` but
         for the worlds that it has refused `[*batch]`: these and the unsolved ones are led along detours or try easier steps, and
         those that still are unsolved shorter ones."""
+        if isinstance(self.solver, Fallbacks):
+            solution = doubted(objective, solution)
         arrived = solution.solved
         if refused is not None:
             status = torch.where(refused & solution.solved, int(Status.STALLED), solution.status)
