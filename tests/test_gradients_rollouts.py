@@ -183,7 +183,7 @@ def test_nothing_but_states_is_kept() -> None:
     """What the graph of a trajectory saves, a step and world: the state's numbers; with checkpoints every ten steps a fifth of that
     at most. Worlds of chain-ground, whose state is 744 bytes."""
     setup = SCENES["chain-ground"](worlds=16)
-    simulator = Simulator(setup.scene, 0.02)
+    simulator = Simulator(setup.scene, 0.02, SMOOTH["energy-momentum"]())
     start = simulator.initial_state(setup.q, setup.v)
     state = sum(x.numel() * x.element_size() for x in tensors_of(start)) / 16
     kept = {}

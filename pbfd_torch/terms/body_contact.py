@@ -25,7 +25,7 @@ from pbfd_torch.errors import ContactOverflowError
 from pbfd_torch.tensors.vectors import applied, extended, in_frames, mapped, outer
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive
-from pbfd_torch.terms.contact_laws import SLACK, ContactLaws, Prepared
+from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.touching import ContactForce, Touching
@@ -69,7 +69,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
     obstacles: tuple[Carrier, ...]
     extent: Tensor
     grip: Tensor
-    slack: float = SLACK
+    slack: float = 0.01
     overflow: Overflow = Overflow.FLAG
 
     def __post_init__(self) -> None:
@@ -104,10 +104,8 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         turned = second[..., :3].mT @ first[..., :3]
         start = in_frames(second, mapped(first, slots.position)) + step.dt[..., None, None] * self._running(slots, turned)
         dt = step.dt[..., None]
-        deep = None if self.deep is None else _of_pairs(self.deep, slots.pair)
         beginning = self._beginning(
             dt,
-            deep,
             lambda: self._gaps(slots, bodies),
             lambda: self._gaps(slots, ahead),
             lambda: self._gaps(slots, torch.cat((step.coasting_poses, obstacles), -3)),
@@ -124,7 +122,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             dt=dt,
             grip=self._gripping(self.grip[slots.pair], firm),
             firm=firm,
-            deep=deep,
+            deep=None if self.deep is None else _of_pairs(self.deep, slots.pair),
             **beginning,
         )
 

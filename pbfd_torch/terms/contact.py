@@ -186,7 +186,6 @@ class Contact(ContactLaws[PreparedContact]):
 
         beginning = self._beginning(
             dt,
-            self.deep,
             lambda: gap(centers, rotations),
             lambda: gap(free(), step.target_poses[..., :3, :3]),
             lambda: gap(self._centers(step.coasting_poses), step.coasting_poses[..., :3, :3]),

@@ -23,8 +23,6 @@ from pbfd_torch.terms.touching import ContactForce, Touching
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement
 
-SLACK = 0.01  # [m] by which bodies may overlap without a hazard: two that are pressed together, not ones that began so
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Prepared:
@@ -32,9 +30,7 @@ class Prepared:
 
     Attributes: `dt` `[*batch, 1]` [s]; `grip` `[*, n]`, see `ContactForce`; `firm` `[*, n]`: what C⊥ is multiplied by; None: 1;
     `deep` `[*, n]` [m]: from which depth on it is a hazard; None: none is; `depth` `[*batch, n]` [m] at the start of the step,
-    where the normal force lets go; `bounce`, `sunk` `[*batch, n]` [m]: how far the solids are moved out to throw a candidate back,
-    and in where it overlapped by more than any contact should: from there it is let out at the release speed, by a force that is
-    no larger than it needs to be."""
+    where the normal force lets go; `bounce` `[*batch, n]` [m]: how far the solids are moved out to throw a candidate back."""
 
     dt: Tensor
     grip: Tensor | None
@@ -42,12 +38,10 @@ class Prepared:
     deep: Tensor | None = None
     depth: Tensor | None = None
     bounce: Tensor | None = None
-    sunk: Tensor | None = None
 
     def raised(self, depth: Tensor) -> Tensor:
         """Depths beside the solids where these are moved to, `[*batch, n]` [m]."""
-        depth = depth if self.bounce is None else depth + self.bounce
-        return depth if self.sunk is None else depth - self.sunk
+        return depth if self.bounce is None else depth + self.bounce
 
 
 P = TypeVar("P", bound=Prepared)
@@ -149,24 +143,18 @@ class ContactLaws(ABC, Generic[P]):
     def _beginning(
         self,
         dt: Tensor,
-        deep: Tensor | None,
         start: Callable[[], Tensor],
         free: Callable[[], Tensor],
         coasting: Callable[[], Tensor],
     ) -> dict[str, Tensor | None]:
-        """`depth`, `bounce` and `sunk` of `Prepared`, from the gaps `[*batch, n]` [m] at the start of the step, at the end of its
+        """`depth` and `bounce` of `Prepared`, from the gaps `[*batch, n]` [m] at the start of the step, at the end of its
         free motion, and at that without any force; they are asked for where they count."""
         lets_go = math.isfinite(self.normal_force.release)
         if self.restitution is None and not lets_go:
             return {}
         gap = start()
         bounce = None if self.restitution is None else self.restitution.bounce(gap, free(), dt, coasting())
-        if not lets_go:
-            return {"bounce": bounce}
-        if deep is None:
-            return {"depth": -gap, "bounce": bounce}
-        sunk = (-gap - deep.clamp_min(SLACK)).clamp_min(0)
-        return {"depth": -gap - sunk, "bounce": bounce, "sunk": sunk}
+        return {"depth": -gap if lets_go else None, "bounce": bounce}
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact of some worlds."""
