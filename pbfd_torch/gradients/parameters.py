@@ -17,6 +17,7 @@ from pbfd_torch.tensors.structures import fields_of
 from pbfd_torch.tensors.worlds import replaced
 
 _PARTS = ("articulation", "terms", "gravity")  # of a scene: what a step knows of it
+_MEASURES = ("deep",)  # tell when a step has a hazard: no motion depends on them
 
 
 def parameters(scene: Scene) -> dict[str, Tensor]:
@@ -70,4 +71,5 @@ def _named(value: Any, name: str) -> Iterator[tuple[str, float | Tensor]]:
                 yield from _named(x, f"{name}.{k}")
     else:
         for key, x in fields_of(value):
-            yield from _named(x, f"{name}.{key}")
+            if key not in _MEASURES:
+                yield from _named(x, f"{name}.{key}")

@@ -219,7 +219,7 @@ class Contact(ContactLaws[PreparedContact]):
     def remembered(self, prepared: PreparedContact, placement: Placement) -> Tensor:
         """What the anchors are behind by after a step that ended at a placement; shapes as in `memory`."""
         if not self._anchors:
-            return prepared.centers[..., :0, :]
+            return prepared.centers.new_zeros((*prepared.centers.shape[:-2], 0, 3))  # a view would keep all of them
         at = self.touching(prepared, placement)
         kept = self._anchors.kept(at.slip, at.depth)
         return kept if prepared.frame is None else turned(prepared.frame[..., :3].mT, kept)
