@@ -40,15 +40,16 @@ def row() -> tuple[Scene, torch.Tensor, torch.Tensor]:
     return scene, q.flatten(1), v
 
 
+@pytest.mark.parametrize(("surplus", "off"), [(math.inf, 1e-8), (1e-3, 1e-6)], ids=["without an account", "with one"])
 @pytest.mark.parametrize("dt", [0.005, 0.01, 0.02, 0.05])
-def test_a_floor_trades_momentum_for_spin(dt: float) -> None:
+def test_a_floor_trades_momentum_for_spin(dt: float, surplus: float, off: float) -> None:
     """Energy–momentum. An impulse at the floor changes m v by as much as I ω/R the other way, one between balls changes the m v of
-    both, oppositely: Σ (v + 2/5 ω R) stays 1 m/s."""
+    both, oppositely: Σ (v + 2/5 ω R) stays 1 m/s. The few steps that the account makes easier ones brake slow spins by φ³."""
     scene, q, v = row()
-    rollout = rolled_out(scene, dt, 0.3, q, v, integrator=EnergyMomentum())
+    rollout = rolled_out(scene, dt, 0.3, q, v, integrator=EnergyMomentum(surplus))
     assert bool(rollout.solved.all())
     end = rollout.v[-1].reshape(6, 6)
-    assert float((end[:, 0] + 0.4 * RADIUS * end[:, 4]).sum()) == pytest.approx(1.0, abs=1e-8)
+    assert float((end[:, 0] + 0.4 * RADIUS * end[:, 4]).sum()) == pytest.approx(1.0, abs=off)
     assert float(end[-1, 0]) > 0.1
 
 
