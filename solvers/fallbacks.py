@@ -179,7 +179,7 @@ class Fallbacks:
 
     def accepted(self, solution: Solution) -> Solution:
         """The solution with roots that have strayed as good enough."""
-        return replaced(solution, ~solution.solved & self._balanced(solution), Status.SOLVED)
+        return solution.marked(~solution.solved & self._balanced(solution), Status.SOLVED)
 
     def _balanced(self, solution: Solution) -> Tensor:
         """Which worlds are at a root, wherever that is, `[*batch]` bool."""
@@ -218,12 +218,7 @@ def doubted(objective: Relaxable, solution: Solution) -> Solution:
     # what is in the host's own memory it may look at; asking a device would make it wait
     if long.device.type == "cpu" and not bool(long.numpy().any()):
         return solution
-    return replaced(solution, long & objective.strayed(solution.q), Status.STALLED)
-
-
-def replaced(solution: Solution, where: Tensor, status: Status) -> Solution:
-    """The solution with another status in the worlds in `where` `[*batch]`."""
-    return dataclasses.replace(solution, status=torch.where(where, int(status), solution.status).to(torch.int32))
+    return solution.marked(long & objective.strayed(solution.q), Status.STALLED)
 
 
 def merged(before: Solution, index: Tensor, climbs: list[Solution], kind: int | None, status: Status) -> Solution:

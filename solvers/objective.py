@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -162,6 +163,10 @@ class Solution:
         """Positions `[n]` in the flattened batch of the worlds that a fallback may help: unsolved, but from a finite start. Whoever
         asks first makes the host wait for a device; it is known after that."""
         return (~self.solved & (self.status != int(Status.NON_FINITE))).reshape(-1).nonzero().squeeze(-1)
+
+    def marked(self, where: Tensor, status: Status) -> Solution:
+        """The same with another status in the worlds in `where` `[*batch]` bool."""
+        return dataclasses.replace(self, status=torch.where(where, int(status), self.status).to(torch.int32))
 
     def within(self, budget: int | Tensor | None, cost: int, index: Tensor | None = None) -> Tensor:
         """Those of the worlds at `index` (None: the `unsolved` ones) that may spend `cost` evaluations more: their budget is a

@@ -187,8 +187,7 @@ class EagerStepper(Generic[S]):
             solution = doubted(objective, solution)
         arrived = solution.solved
         if refused is not None:
-            status = torch.where(refused & solution.solved, int(Status.STALLED), solution.status)
-            solution = dataclasses.replace(solution, status=status.to(torch.int32))
+            solution = solution.marked(refused & solution.solved, Status.STALLED)
         index = solution.unsolved  # the only question of a step that is solved: a device makes the host wait for it
         if len(index) == 0:
             return advanced, solution, Way(solution.q, (), objective)

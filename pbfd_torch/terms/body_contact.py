@@ -104,7 +104,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
         turned = second[..., :3].mT @ first[..., :3]
         start = in_frames(second, mapped(first, slots.position)) + step.dt[..., None, None] * self._running(slots, turned)
         dt = step.dt[..., None]
-        beginning = self._beginning(
+        depth, bounce = self._beginning(
             dt,
             lambda: self._gaps(slots, bodies),
             lambda: self._gaps(slots, ahead),
@@ -123,7 +123,8 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             grip=self._gripping(self.grip[slots.pair], firm),
             firm=firm,
             deep=None if self.deep is None else _of_pairs(self.deep, slots.pair),
-            **beginning,
+            depth=depth,
+            bounce=bounce,
         )
 
     def _running(self, slots: Slots, turned: Tensor) -> Tensor:

@@ -184,7 +184,7 @@ class Contact(ContactLaws[PreparedContact]):
         def gap(points: Tensor, rotations: Tensor) -> Tensor:
             return -self._depth(surface.field(seen(frame, points)), frame, rotations)
 
-        beginning = self._beginning(
+        depth, bounce = self._beginning(
             dt,
             lambda: gap(centers, rotations),
             lambda: gap(free(), step.target_poses[..., :3, :3]),
@@ -200,7 +200,8 @@ class Contact(ContactLaws[PreparedContact]):
             grip=self._gripping(self.grip, self.firm),
             firm=self.firm,
             deep=self.deep,
-            **beginning,
+            depth=depth,
+            bounce=bounce,
         )
 
     def depths(self, prepared: PreparedContact, placement: Placement) -> Tensor:

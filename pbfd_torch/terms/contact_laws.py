@@ -146,15 +146,15 @@ class ContactLaws(ABC, Generic[P]):
         start: Callable[[], Tensor],
         free: Callable[[], Tensor],
         coasting: Callable[[], Tensor],
-    ) -> dict[str, Tensor | None]:
+    ) -> tuple[Tensor | None, Tensor | None]:
         """`depth` and `bounce` of `Prepared`, from the gaps `[*batch, n]` [m] at the start of the step, at the end of its
         free motion, and at that without any force; they are asked for where they count."""
         lets_go = math.isfinite(self.normal_force.release)
         if self.restitution is None and not lets_go:
-            return {}
+            return None, None
         gap = start()
         bounce = None if self.restitution is None else self.restitution.bounce(gap, free(), dt, coasting())
-        return {"depth": -gap if lets_go else None, "bounce": bounce}
+        return -gap if lets_go else None, bounce
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact of some worlds."""
