@@ -7,6 +7,7 @@ segment and a sphere a rounded point. Flat hulls are polygons with two opposite 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pbfd_torch.contact.shapes import Curved, Point, Points, Rim, Shape
+from pbfd_torch.contact.shapes import ConvexHull, Curved, Point, Points, Rim, Shape
 from pbfd_torch.errors import InputError
 
 Indices = NDArray[np.int64]
@@ -66,6 +67,16 @@ class Polytope:
 def polytope_of(shape: Shape) -> Polytope:
     """The hull of the candidate points of a shape, rounded by their radius. Raises `InputError` where there is no candidate, one
     is not finite or the radii differ."""
+    return _kept(shape) if isinstance(shape, ConvexHull) else _made(shape)
+
+
+@functools.lru_cache(maxsize=256)
+def _kept(shape: ConvexHull) -> Polytope:
+    """Of a hull, which takes long and is asked for by all that it may touch."""
+    return _made(shape)
+
+
+def _made(shape: Shape) -> Polytope:
     centers, radii = shape.candidates()
     if len(centers) == 0 or not (np.isfinite(centers).all() and np.isfinite(radii).all()):
         raise InputError(f"{type(shape).__name__} has {len(centers)} candidate points: must be ≥ 1, all finite")
@@ -97,7 +108,7 @@ def half_thickness(shape: Shape) -> float:
 
 def _hull(points: Points) -> tuple[Points, list[Indices]]:
     """Vertices of the convex hull of points, and the ordered vertices of each face."""
-    from scipy.spatial import ConvexHull
+    from scipy.spatial import ConvexHull as Quickhull
 
     center = points.mean(0)
     _, spread, axes = np.linalg.svd(points - center, full_matrices=False)
@@ -109,10 +120,10 @@ def _hull(points: Points) -> tuple[Points, list[Indices]]:
     if rank == 1:
         return points[[along[:, 0].argmin(), along[:, 0].argmax()]], []
     if rank == 2:
-        ring = ConvexHull(along[:, :2]).vertices
+        ring = Quickhull(along[:, :2]).vertices
         front = np.arange(len(ring))
         return points[ring], [front, front[::-1]]
-    hull = ConvexHull(points)
+    hull = Quickhull(points)
     vertices = points[hull.vertices]
     on_plane = np.abs(vertices @ hull.equations[:, :3].T + hull.equations[:, 3]) <= _FLAT * size
     sets, first = np.unique(on_plane, axis=1, return_index=True)
