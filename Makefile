@@ -7,13 +7,17 @@ BIN := .venv/bin
 # One thread each: matrices are small, and the workers share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint format notebooks clean
+.PHONY: demo test fuzz lint format notebooks clean
 
 demo: .venv/.installed
 	$(BIN)/pbfd demo --out demo
 
 test: .venv/.installed
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# Damaged and extreme inputs, thousands of each kind; `make test` tries a few of them.
+fuzz: .venv/.installed
+	$(BIN)/python -m pytest $(PYTEST_ARGS) tests/fuzz --hypothesis-profile=long
 
 lint: .venv/.installed
 	$(BIN)/ruff check
