@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.assembly import Balance
-from pbfd_torch.balance.dynamics import armature_diagonal
+from pbfd_torch.balance.dynamics import armature_diagonal, kinetic_energy
 from pbfd_torch.balance.outlook import Outlook
 from pbfd_torch.errors import InputError
 from pbfd_torch.solvers.objective import Evaluation, weighted_error
@@ -151,13 +151,18 @@ class BalanceObjective:
 
     def strayed(self, q: Tensor) -> Tensor:
         """Whether a step that ended at q has turned a joint by more than a quarter turn, and not because its free motion leads
-        there, while something touches, `[*batch]` bool: such a root need not be where the motion goes."""
+        there, with more kinetic energy than the free motion has, while something touches, `[*batch]` bool: such a root need not
+        be where the motion goes. What strikes may fold up fast; what stands may not turn over."""
         a = self.articulation
         far = torch.minimum(*(self.turn(difference(a, x, q)) for x in (self.step.previous.q, self.guess))) > FARTHEST
         # what is in the host's own memory it may look at; asking a device would make it wait
         if far.device.type == "cpu" and not bool(far.numpy().any()):
             return far
-        return far & (self.push(q) > 0)
+        step, a = self.step, self.articulation
+        moved, free = (
+            kinetic_energy(a, (poses - step.previous.poses)[..., :3, :]) for poses in (place(a, q).poses, step.target_poses)
+        )
+        return far & (self.push(q) > 0) & (moved > free)
 
     def seen_from(self, distance: float) -> Self:
         """The same step with normal forces that set in `distance` [m] before anything touches."""
