@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,11 @@ import numpy as np
 
 from pbfd_torch.contact.shapes import ConvexHull, Points
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import TRIANGLES, require_count, require_file_size
+from pbfd_torch.loading.report import naming
 
 MAX_VERTICES = 64
+MESHES = (".stl", ".obj", ".ply", ".dae")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,21 @@ class HullLosses:
         return [f"convex hulls are cut to {MAX_VERTICES} vertices ({len(self.metres)}): at most {lost} lost ({worst})"]
 
 
+def require_triangles(file: Path) -> None:
+    """Raises `ModelError` for a mesh file that is too large, before it is read."""
+    require_file_size(file)
+    head = file.open("rb").read(84)
+    if file.suffix.lower() == ".stl" and len(head) == 84:
+        (count,) = struct.unpack("<I", head[80:])
+        if file.stat().st_size == 84 + 50 * count:  # it is not one in text
+            _require_few(file, count)
+
+
+def _require_few(file: Path, triangles: int) -> None:
+    with naming("", f"mesh '{file}'"):
+        require_count("triangles", triangles, TRIANGLES, "simplify it")
+
+
 def load_hull(file: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0), max_vertices: int = MAX_VERTICES) -> ReducedHull:
     """Convex hull of a mesh file (STL, OBJ, PLY, COLLADA) in metres, with at most `max_vertices` vertices. Of a COLLADA file the
     unit is applied and the up-axis is not, as everywhere in ROS. Raises `ModelError` for a file that holds no usable mesh."""
@@ -59,6 +78,9 @@ def read_mesh(file: Path) -> Any:
     """All parts of a mesh file as one `trimesh.Trimesh` in metres; see `load_hull`."""
     import trimesh
 
+    if file.suffix.lower() not in MESHES:
+        raise ModelError(f"mesh '{file}': extension must be one of {', '.join(MESHES)}")
+    require_triangles(file)
     if file.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
         raise ModelError(f"mesh '{file}': reading COLLADA files needs the package pycollada (pip install pycollada)")
     try:
@@ -71,6 +93,7 @@ def read_mesh(file: Path) -> Any:
         raise ModelError(f"mesh '{file}' cannot be read: {error}") from error
     if not sum(len(part.vertices) for part in parts):
         raise ModelError(f"mesh '{file}' holds no vertices")
+    _require_few(file, sum(len(getattr(part, "faces", ())) for part in parts))
     whole: Any = trimesh.util.concatenate([trimesh.Trimesh(x.vertices, getattr(x, "faces", None), process=False) for x in parts])
     return whole.apply_scale(_collada_unit(file)) if file.suffix.lower() == ".dae" else whole
 

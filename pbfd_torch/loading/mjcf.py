@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import require_link_count, require_links
 from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
@@ -36,7 +37,10 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
     model = compile_mjcf(Path(path))
     with naming(str(path)):
         gravity = _gravity(model)
-        articulation, terms = articulate(_links(model), _properties(model), dtype, device)
+        require_link_count(model.data.nbody - 1, model.data.nv)
+        links = _links(model)
+        require_links(links)
+        articulation, terms = articulate(links, _properties(model), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
         collisions = mjcf_collisions(model)
     actuators = Actuators.from_list(articulation, drives) if drives else None

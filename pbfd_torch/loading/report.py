@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
+
+from tqdm import tqdm
 
 from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
+
+T = TypeVar("T")
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
@@ -43,6 +49,20 @@ def listing(names: Iterable[str], most: int = 5) -> str:
     every = list(names)
     rest = len(every) - most
     return ", ".join(every) if rest <= 1 else f"{', '.join(every[:most])} and {rest} more"
+
+
+def progress(items: Sequence[T], what: str) -> Iterator[T]:
+    """The items, with a bar on a terminal once they have taken a second."""
+    with tqdm(items, desc=what, delay=1.0, leave=False, disable=not sys.stderr.isatty()) as bar:
+        yield from bar
+
+
+@contextmanager
+def announced(what: str, count: int, slow_from: int) -> Iterator[None]:
+    """Says on a terminal what is being done to so many, from as many on as take more than a second."""
+    with tqdm(total=count, desc=what, leave=False, disable=count < slow_from or not sys.stderr.isatty()) as bar:
+        yield
+        bar.update(count)
 
 
 def warn_not_modelled(file: Path, lines: Sequence[str]) -> tuple[str, ...]:

@@ -12,7 +12,6 @@ import numpy as np
 
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.meshes import find_mesh, read_mesh
-from pbfd_torch.loading.report import existing_file
 from pbfd_torch.loading.urdf_colliders import primitive
 from pbfd_torch.loading.urdf_file import complaints, root_of
 from pbfd_torch.loading.urdf_placement import Placed
@@ -25,7 +24,7 @@ def urdf_visuals(path: Path, links: Sequence[str]) -> tuple[Visual, ...]:
     """Of the links of these names, in this order. A visual that cannot be read is left out with a warning."""
     from pytorch_kinematics.urdf_parser_py import urdf, xml_reflection
 
-    root = root_of(existing_file(path))
+    root = root_of(path)
     named = {x.get("name"): x for x in root.findall("material")}
     found = []
     with complaints():
