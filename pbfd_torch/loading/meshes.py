@@ -16,7 +16,7 @@ import numpy as np
 from pbfd_torch.contact.shapes import ConvexHull, Points
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.bounds import TRIANGLES, require_count, require_file_size
-from pbfd_torch.loading.report import naming
+from pbfd_torch.loading.report import first_bytes, naming
 
 MAX_VERTICES = 64
 MESHES = (".stl", ".obj", ".ply", ".dae")
@@ -53,7 +53,7 @@ class HullLosses:
 def require_triangles(file: Path) -> None:
     """Raises `ModelError` for a mesh file that is too large, before it is read."""
     require_file_size(file)
-    head = file.open("rb").read(84)
+    head = first_bytes(file, 84)
     if file.suffix.lower() == ".stl" and len(head) == 84:
         (count,) = struct.unpack("<I", head[80:])
         if file.stat().st_size == 84 + 50 * count:  # it is not one in text

@@ -11,7 +11,7 @@ from typing import Any
 
 from pbfd_torch.loading.bounds import GRID_POINTS, SHAPES, require_count, require_file_size
 from pbfd_torch.loading.meshes import require_triangles
-from pbfd_torch.loading.report import naming
+from pbfd_torch.loading.report import first_bytes, naming
 from pbfd_torch.loading.xml_file import read_xml, require_finite
 
 ELEMENTS = 100_000
@@ -150,7 +150,7 @@ def _files(node: Any, folders: dict[str, list[Path]]) -> Iterator[Path]:
 
 def _image_size(file: Path) -> int:
     """Pixels of a PNG file by its header, points of one in MuJoCo's own format of height fields; 0 for others."""
-    head = file.open("rb").read(24)
+    head = first_bytes(file, 24)
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
         width, height = struct.unpack(">II", head[16:24])
         return int(width * height)

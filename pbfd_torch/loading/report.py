@@ -33,6 +33,12 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     return file
 
 
+def first_bytes(file: Path, count: int) -> bytes:
+    """At most so many."""
+    with file.open("rb") as stream:
+        return stream.read(count)
+
+
 @contextmanager
 def naming(file: str, element: str = "") -> Iterator[None]:
     """Adds the file, and where it is missing the element, to errors raised inside."""
