@@ -90,7 +90,9 @@ def test_numbers_are_printed_as_people_write_them(pbfd: Pbfd, tmp_path: Path) ->
     """0.1, not 0.10000000149011612."""
     file = tmp_path / "step.xml"
     ball = "<body><freejoint/><geom size='0.1'/></body>"
-    world = f"<option gravity='0 0.1 -9.8'/><worldbody><geom name='step' type='box' size='1 1 1' pos='0.1 0 -1.3'/>{ball}</worldbody>"
+    world = (
+        f"<option gravity='0 0.1 -9.8'/><worldbody><geom name='step' type='box' size='1 1 1' pos='0.1 0 -1.3'/>{ball}</worldbody>"
+    )
     file.write_text(f"<mujoco>{world}</mujoco>")
     out = pbfd("info", file).out
     assert "obstacle: step, Box at [0.1, 0, -1.3]\n" in out

@@ -57,16 +57,18 @@ def listing(names: Iterable[str], most: int = 5) -> str:
     return ", ".join(every) if rest <= 1 else f"{', '.join(every[:most])} and {rest} more"
 
 
-def progress(items: Sequence[T], what: str) -> Iterator[T]:
+def progress(items: Sequence[T], what: str) -> Iterable[T]:
     """The items, with a bar on a terminal once they have taken a second."""
-    with tqdm(items, desc=what, delay=1.0, leave=False, disable=not sys.stderr.isatty()) as bar:
-        yield from bar
+    return tqdm(items, desc=what, delay=1.0, leave=False) if sys.stderr.isatty() else items
 
 
 @contextmanager
 def announced(what: str, count: int, slow_from: int) -> Iterator[None]:
     """Says on a terminal what is being done to so many, from as many on as take more than a second."""
-    with tqdm(total=count, desc=what, leave=False, disable=count < slow_from or not sys.stderr.isatty()) as bar:
+    if count < slow_from or not sys.stderr.isatty():
+        yield
+        return
+    with tqdm(total=count, desc=what, leave=False) as bar:
         yield
         bar.update(count)
 
