@@ -30,9 +30,9 @@ def load_robot(
     """Loads a URDF file (.urdf, or .xml with root <robot>) or an MJCF file (.xml or .mjcf with root <mujoco>).
 
     `free_base` and `excluded`, URDF only: see `load_urdf`; an MJCF file says itself what is free and what never touches. Raises
-    `ModelError` naming the file and the element that cannot be used, and `InputError` for these two with MJCF and for a device that
-    is not there. What the file asks
-    for and the simulation leaves out is in `Robot.not_modelled`, and given as `NotModelledWarning`.
+    `ModelError` naming the file and the element that cannot be used or is too large (`loading.bounds`), and `InputError` for these
+    two with MJCF and for a device that is not there. What the file asks for and the simulation leaves out is in
+    `Robot.not_modelled`, and given as `NotModelledWarning`.
     """
     _require_device(device)
     file = existing_file(path)
