@@ -30,10 +30,10 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
 
     Geoms that can collide become colliders, those fixed to the world obstacles. Meshes become their convex hulls; a height field
     goes on beyond its border and has no bottom. Who touches whom is as in MuJoCo (contype, conaffinity, <exclude>, <pair>; not a
-    body and its parent), also where shapes overlap. A geom with condim 1 is frictionless. Numbers of MuJoCo's own method
-    (integrator, solver, solref, solimp, margin) are not read: they and all others that are not are in `Robot.not_modelled`; the time
-    step is that of the run. Raises `ModelError` with MuJoCo's own words, or naming the element that cannot be used, too large
-    (`loading.bounds`) or not finite.
+    body and its parent), also where shapes overlap. A geom with condim 1 is frictionless. The time step is that of each run. Other
+    numbers of MuJoCo's own method (integrator, solver, solref, solimp, margin) are not read, and named in `Robot.not_modelled`.
+    Raises `ModelError` with MuJoCo's own words, or naming the element that cannot be used, is too large (`loading.bounds`) or not
+    finite.
     """
     model = compile_mjcf(Path(path))
     with naming(str(path)):
