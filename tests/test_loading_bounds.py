@@ -117,9 +117,16 @@ LARGE = {
         r"has 150000 pairs of shapes that may touch: at most 50000",
     ),
     "elements": (mjcf("<site/>" * 200_000 + BODY), r"has \d+ elements: at most 100000"),
+    "planes": (mjcf("<geom type='plane' size='1 1 1'/>" * 101 + BODY), r"has 101 planes and height fields: at most 100"),
+    "copied bodies": (mjcf(f"<replicate count='1999'>{BODY}</replicate>"), r"has 1999 links: at most 1000"),
+    "actuator": (mjcf(BODY, "<actuator><position joint='j' kp='1e300' kv='1e300'/></actuator>"), r"actuator 'actuator0': "),
     "copies": (
         mjcf(f"<replicate count='1000'><replicate count='1000'>{BODY}</replicate></replicate>"),
-        r":2: replicate: has 1000000 copies",
+        r"has 1000000 links",
+    ),
+    "copied sites": (
+        mjcf(f"<replicate count='100'><replicate count='100'><site/></replicate></replicate>{BODY}"),
+        r":2: replicate: has 10000 copies: at most 2000",
     ),
     "points": (
         mjcf(FIELD, "<asset><hfield name='h' nrow='100000' ncol='100000' size='1 1 1 1'/></asset>"),
@@ -177,7 +184,12 @@ MESHES = {
     "one point": ("part.stl", stl(5), r"1 distinct vertices: a convex hull needs at least 4"),
     "no XML": ("part.dae", b"not XML", r"part\.dae' cannot be read"),
     "other kind": ("part.step", b"x", r"part\.step': extension must be one of \.stl, \.obj, \.ply, \.dae"),
-    "not finite": ("part.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n", r"vertices and scale must be finite"),
+    "not finite": (
+        "part.obj",
+        b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n",
+        r"part\.obj': vertices must be finite, three numbers each",
+    ),
+    "plane": ("part.obj", b"v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n", r"vertices must be finite, three numbers each"),
     "folder": ("part", None, r"mesh 'part' not found"),
     "missing": ("no.stl", None, r"mesh 'no\.stl' not found"),
 }

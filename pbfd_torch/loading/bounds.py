@@ -25,6 +25,7 @@ from pbfd_torch.tree.articulation import Joint, JointKind, Link
 LINKS = 1000
 DEGREES_OF_FREEDOM = 2000
 SHAPES = 1000  # of links, and as many of the world
+GROUNDS = 100  # planes and height fields, each of which is asked on its own
 PAIRS = 50_000  # of shapes that may touch
 SLOW_PAIRS = 5_000  # from which on setting up contacts takes more than a second
 GRID_POINTS = 4_000_000  # of a height field
@@ -84,6 +85,8 @@ def require_shapes(colliders: Sequence[Collider], obstacles: Sequence[HalfSpace 
     """Raises `ModelError` for too many shapes or pairs of them that may touch."""
     require_count("shapes on links", len(colliders), SHAPES, "simplify what collides")
     require_count("shapes of the world", len(obstacles), SHAPES, "simplify what collides")
+    grounds = [x for x in obstacles if isinstance(x, HalfSpace) or isinstance(x.shape, HeightField)]
+    require_count("planes and height fields", len(grounds), GROUNDS, "use fewer")
     require_count("pairs of shapes that may touch", pair_count(colliders, obstacles), PAIRS, "simplify what collides")
 
 

@@ -69,14 +69,13 @@ def load_hull(file: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0), m
     """Convex hull of a mesh file (STL, OBJ, PLY, COLLADA) in metres, with at most `max_vertices` vertices. Of a COLLADA file the
     unit is applied and the up-axis is not, as everywhere in ROS. Raises `ModelError` for a file that holds no usable mesh."""
     vertices: Points = np.asarray(read_mesh(file).vertices, np.float64)
-    if not np.isfinite(vertices).all() or not np.isfinite(scale).all():
-        raise ModelError(f"mesh '{file}': vertices and scale must be finite")
+    if not np.isfinite(scale).all():
+        raise ModelError(f"mesh '{file}': scale is {scale}: must be finite")
     return reduced_hull(vertices * np.array(scale), max_vertices, name=str(file))
 
 
 def read_mesh(file: Path) -> Any:
     """All parts of a mesh file as one `trimesh.Trimesh` in metres; see `load_hull`."""
-    import trimesh
 
     if file.suffix.lower() not in MESHES:
         raise ModelError(f"mesh '{file}': extension must be one of {', '.join(MESHES)}")
@@ -84,13 +83,28 @@ def read_mesh(file: Path) -> Any:
     if file.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
         raise ModelError(f"mesh '{file}': reading COLLADA files needs the package pycollada (pip install pycollada)")
     try:
-        scene: Any = trimesh.load_scene(file, process=False, skip_materials=True)
-        parts = [
-            scene.geometry[name].copy().apply_transform(matrix)
-            for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
-        ]
+        whole = _joined(file)
+    except ModelError:
+        raise
     except Exception as error:  # trimesh raises whatever its readers raise
         raise ModelError(f"mesh '{file}' cannot be read: {error}") from error
+    vertices, faces = np.asarray(whole.vertices), np.asarray(whole.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        raise ModelError(f"mesh '{file}': vertices must be finite, three numbers each")
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ModelError(f"mesh '{file}': faces name vertices {faces.min()} to {faces.max()}: must be 0 to {len(vertices) - 1}")
+    return whole
+
+
+def _joined(file: Path) -> Any:
+    """As trimesh reads it."""
+    import trimesh
+
+    scene: Any = trimesh.load_scene(file, process=False, skip_materials=True)
+    parts = [
+        scene.geometry[name].copy().apply_transform(matrix)
+        for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
+    ]
     if not sum(len(part.vertices) for part in parts):
         raise ModelError(f"mesh '{file}' holds no vertices")
     _require_few(file, sum(len(getattr(part, "faces", ())) for part in parts))

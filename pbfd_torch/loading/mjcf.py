@@ -44,7 +44,7 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
         articulation, terms = articulate(links, _properties(model), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
         collisions = mjcf_collisions(model)
-    actuators = Actuators.from_list(articulation, drives) if drives else None
+        actuators = Actuators.from_list(articulation, drives) if drives else None
     return Robot(
         name=model.name,
         articulation=articulation,

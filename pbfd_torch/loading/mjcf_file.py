@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pbfd_torch.loading.bounds import GRID_POINTS, SHAPES, require_count, require_file_size
+from pbfd_torch.loading.bounds import GRID_POINTS, SHAPES, require_count, require_file_size, require_link_count
 from pbfd_torch.loading.meshes import require_triangles
 from pbfd_torch.loading.report import first_bytes, naming
 from pbfd_torch.loading.xml_file import read_xml, require_finite
 
 ELEMENTS = 100_000
-COPIES = 10 * SHAPES  # that <replicate>, <composite> and <flexcomp> make
+COPIES = 2 * SHAPES  # that <replicate>, <composite> and <flexcomp> make
 PIXELS = 2**26  # of a texture, which MuJoCo reads too
 RESERVED = 10_000  # entries of what <size> makes for users
 _ENDLESS = ("range", "ctrlrange", "forcerange", "actuatorfrcrange", "actrange", "lengthrange")  # infinite: there is no limit
@@ -90,6 +90,7 @@ def require_compilable(sources: list[Source]) -> None:
     count = sum(sum(1 for _ in source.root.iter()) for source in sources)
     with naming(str(sources[0].path)):
         require_count("elements", count, ELEMENTS, "make it smaller")
+        require_link_count(sum(_copies(body) for source in sources for body in source.root.iter("body")))
     folders = _folders(sources)
     for source in sources:
         require_finite(source.root, source.path, _WORDS, _ENDLESS)
@@ -101,8 +102,7 @@ def require_compilable(sources: list[Source]) -> None:
 def _require_bounded(node: Any, folders: dict[str, list[Path]]) -> None:
     match node.tag:
         case "replicate" | "composite" | "flexcomp":
-            around = (x for x in (node, *node.iterancestors()) if x.tag in ("replicate", "composite", "flexcomp"))
-            require_count("copies", math.prod(_whole(x, "count") for x in around), COPIES, "ask for fewer")
+            require_count("copies", _copies(node), COPIES, "ask for fewer")
         case "size":
             for key in set(node.attrib) - {"memory", "njmax", "nconmax", "nstack"}:  # MuJoCo itself bounds these by its memory
                 require_count(f"entries of {key}", _whole(node, key), RESERVED, "leave it out")
@@ -121,6 +121,11 @@ def _require_bounded(node: Any, folders: dict[str, list[Path]]) -> None:
         case "mesh" | "skin" | "flexcomp" if "file" in node.attrib:
             for file in _files(node, folders):
                 require_triangles(file)
+
+
+def _copies(node: Any) -> int:
+    """How often an element is there, made by itself and by those around it."""
+    return math.prod(_whole(x, "count") for x in (node, *node.iterancestors()) if x.tag in ("replicate", "composite", "flexcomp"))
 
 
 def _whole(node: Any, key: str) -> int:

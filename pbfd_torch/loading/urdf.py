@@ -62,7 +62,7 @@ def load_urdf(
         articulation, terms = articulate(links, properties, dtype, device)
         driven = [name for name in articulation.joint_names if name in properties]
         motors = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
-    actuators = Actuators.from_list(articulation, motors) if motors else None
+        actuators = Actuators.from_list(articulation, motors) if motors else None
     collisions = urdf_collisions(file, articulation, standing, excluded)
     return Robot(
         name=file.name,
