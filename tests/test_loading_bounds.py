@@ -44,7 +44,7 @@ URDF = {
     "far shape": ('xyz="0 0 0"', 'xyz="0 1e7 0"', r"position is 0, 1e\+07, 0 m: must be within 100000 m"),
     "infinite angle": ('xyz="0 0 0"', 'rpy="0 inf 0"', r":2: collision 'c': rpy of <origin> is '0 inf 0': must be finite numbers"),
     "overflow": ('xyz="0 0 0"', 'xyz="0 1e999 0"', r":2: collision 'c': xyz of <origin> is '0 1e999 0'"),
-    "light": ('mass value="2"', 'mass value="1e-300"', r"link 'a': mass is 1e-300 kg: must be 0 or from 1e-09 to 1e\+13"),
+    "light": ('mass value="2"', 'mass value="1e-300"', r"link 'a': mass is 1e-300 kg: must be 0 or from 1e-15 to 1e\+13"),
     "heavy": ('mass value="2"', 'mass value="1e300"', r"link 'a': mass is 1e\+300 kg"),
     "massless": ('mass value="2"', 'mass value="0"', r"no link can move"),
     "large moment": ('ixx="1"', 'ixx="1e30"', r"link 'a': moment of inertia is 1e\+30 kg m²: must be at most 1e\+20"),
@@ -142,9 +142,9 @@ LARGE = {
     "infinite geom": (mjcf(BODY.replace("'1'", "'inf'")), r":2: geom 'g': size of <geom> is 'inf': must be finite"),
     "infinite option": (mjcf(BODY, "<option viscosity='inf'/>"), r"viscosity of <option> is 'inf'"),
     "NaN range": (mjcf(BODY.replace("<joint", "<joint range='0 nan'")), r"range of <joint> is '0 nan': must be numbers"),
-    "light": (
-        mjcf("<body name='b'><joint/><inertial pos='0 0 0' mass='1e-12' diaginertia='1 1 1'/></body>"),
-        r"link 'b': mass is 1e-12 kg",
+    "heavy": (
+        mjcf("<body name='b'><joint/><inertial pos='0 0 0' mass='1e14' diaginertia='1 1 1'/></body>"),
+        r"link 'b': mass is 1e\+14 kg",
     ),
 }
 

@@ -34,7 +34,7 @@ FILE_BYTES = 64 * 2**20  # of a file of any kind
 SMALLEST = 1e-9  # [m] of a shape
 LARGEST = 1e3  # [m] of a shape that a link carries, from its middle
 FARTHEST = 1e5  # [m] of a link in its parent's frame, and of obstacles and their sizes
-MASSES = (1e-9, 1e13)  # [kg], besides 0
+MASSES = (1e-15, 1e13)  # [kg], besides 0
 MOMENT = 1e20  # [kg m²]
 COORDINATE = 1e5  # [rad, m] of a reference, and of limits towards it
 
