@@ -52,6 +52,27 @@ URDF = {
 }
 
 
+POINT = "<link name='world'/><link name='b'><inertial><origin xyz='0.1 0 0'/><mass value='1'/></inertial></link>"
+URDF_MORE = {
+    "point mass": (
+        f"{POINT}<joint name='j' type='planar'><parent link='world'/><child link='b'/><axis xyz='0 0 1'/></joint>",
+        r"joint 'j_turn' can move against those before it so that no mass moves: link 'b', or what it carries, needs inertia",
+    ),
+    "twice": (LINK.replace("</link>", f"{SOLID}</link>"), r":2: link 'a': <inertial> is there 2 times: must be there once"),
+    "endless the wrong way": (
+        LINK + LINK.replace('"a"', '"b"') + '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
+        '<limit lower="inf" upper="inf"/></joint>',
+        r"joint 'j': reference is 0 and limits are inf, inf",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", URDF_MORE)
+def test_urdf_robots_that_cannot_move(tmp_path: Path, what: str) -> None:
+    links, words = URDF_MORE[what]
+    refused(tmp_path / "robot.urdf", f"<robot name='r'>\n{links}</robot>", words)
+
+
 @pytest.mark.parametrize("what", URDF)
 def test_numbers_of_a_urdf(tmp_path: Path, what: str) -> None:
     old, new, words = URDF[what]
@@ -119,6 +140,14 @@ LARGE = {
     "elements": (mjcf("<site/>" * 200_000 + BODY), r"has \d+ elements: at most 100000"),
     "planes": (mjcf("<geom type='plane' size='1 1 1'/>" * 101 + BODY), r"has 101 planes and height fields: at most 100"),
     "copied bodies": (mjcf(f"<replicate count='1999'>{BODY}</replicate>"), r"has 1999 links: at most 1000"),
+    "gear": (
+        mjcf(BODY, "<actuator><motor joint='j' gear='1e300'/></actuator>"),
+        r"actuator 'actuator0': gear is 1e\+300: must be from",
+    ),
+    "stiff": (
+        mjcf(BODY.replace("<joint", "<joint damping='1e300'")),
+        r"joint 'j': damping is 1e\+300: must be ≥ 0 and at most 1e\+20",
+    ),
     "actuator": (mjcf(BODY, "<actuator><position joint='j' kp='1e300' kv='1e300'/></actuator>"), r"actuator 'actuator0': "),
     "copies": (
         mjcf(f"<replicate count='1000'><replicate count='1000'>{BODY}</replicate></replicate>"),
@@ -191,6 +220,8 @@ MESHES = {
     ),
     "plane": ("part.obj", b"v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n", r"vertices must be finite, three numbers each"),
     "folder": ("part", None, r"mesh 'part' not found"),
+    "no address": ("http://[x", None, r"mesh 'http://\[x' cannot be looked for"),
+    "long": ("x" * 9000, None, r"mesh 'x{60}…' cannot be looked for: File name too long"),
     "missing": ("no.stl", None, r"mesh 'no\.stl' not found"),
 }
 

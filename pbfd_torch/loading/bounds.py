@@ -20,6 +20,7 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.pairing import touch
 from pbfd_torch.contact.shapes import Collider, Shape, Solid
 from pbfd_torch.errors import ModelError
+from pbfd_torch.terms.actuators import Actuator
 from pbfd_torch.tree.articulation import Joint, JointKind, Link
 
 LINKS = 1000
@@ -36,6 +37,7 @@ LARGEST = 1e3  # [m] of a shape that a link carries, from its middle
 FARTHEST = 1e5  # [m] of a link in its parent's frame, and of obstacles and their sizes
 MASSES = (1e-15, 1e13)  # [kg], besides 0
 MOMENT = 1e20  # [kg m²]
+FORCE = 1e20  # in SI units, of actuators, springs, damping, friction and armature at joints
 COORDINATE = 1e5  # [rad, m] of a reference, and of limits towards it
 
 
@@ -79,6 +81,19 @@ def _require_joint(joint: Joint) -> None:
         )
     if joint.kind in (JointKind.HINGE, JointKind.SLIDE) and math.hypot(*joint.axis) > COORDINATE:
         raise ModelError(f"axis is {joint.axis}: must be at most {COORDINATE:g} long", element=element)
+
+
+def require_actuators(actuators: Sequence[Actuator]) -> None:
+    """Raises `ModelError` naming the actuator whose numbers are out of range."""
+    for x in actuators:
+        for what in ("gear", "gain", "bias", "stiffness", "damping"):
+            if not abs(getattr(x, what)) <= FORCE:
+                value = getattr(x, what)
+                raise ModelError(f"{what} is {value:.4g}: must be from {-FORCE:g} to {FORCE:g}", element=f"actuator '{x.name}'")
+        for what, (low, high) in {"control range": x.control_range, "force range": x.force_range}.items():
+            if any(math.isfinite(y) and abs(y) > FORCE for y in (low, high)) or low == math.inf or high == -math.inf:
+                words = f"{what} is {low:.4g} to {high:.4g}: must be within {FORCE:g}, or endless"
+                raise ModelError(words, element=f"actuator '{x.name}'")
 
 
 def require_shapes(colliders: Sequence[Collider], obstacles: Sequence[HalfSpace | Obstacle]) -> None:

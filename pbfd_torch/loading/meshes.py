@@ -184,14 +184,21 @@ def _distance(points: Points, triangles: Points) -> float:
 def find_mesh(filename: str, robot_file: Path) -> Path:
     """The file that a URDF means by `package://NAME/PATH`, `file://…` or a path relative to itself. A package is looked for above
     the robot file and in ROS_PACKAGE_PATH. Raises `ModelError` saying where it looked."""
+    try:
+        places = _places(filename, robot_file)
+        found = next((place for place in places if place.is_file()), None)
+    except (ValueError, OSError) as error:  # is no address, holds a zero byte, or is too long for a name
+        shown = filename if len(filename) <= 60 else f"{filename[:60]}…"
+        raise ModelError(f"mesh '{shown}' cannot be looked for: {getattr(error, 'strerror', None) or error}") from None
+    if found is None:
+        raise ModelError(f"mesh '{filename}' not found; looked at {', '.join(map(str, places))}")
+    return found
+
+
+def _places(filename: str, robot_file: Path) -> list[Path]:
     url = urlparse(filename)
     if url.scheme in ("package", "model"):
         inside = unquote(url.path).lstrip("/")
         roots = [*robot_file.absolute().parents, *(Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p)]
-        places = [root / inside for root in roots if root.name == url.netloc] + [root / url.netloc / inside for root in roots]
-    else:
-        places = [robot_file.absolute().parent / (unquote(url.path) if url.scheme == "file" else filename)]
-    for place in places:
-        if place.is_file():
-            return place
-    raise ModelError(f"mesh '{filename}' not found; looked at {', '.join(map(str, places))}")
+        return [root / inside for root in roots if root.name == url.netloc] + [root / url.netloc / inside for root in roots]
+    return [robot_file.absolute().parent / (unquote(url.path) if url.scheme == "file" else filename)]

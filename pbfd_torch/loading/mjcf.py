@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.bounds import require_link_count, require_links
+from pbfd_torch.loading.bounds import require_actuators, require_link_count, require_links
 from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
@@ -43,6 +43,7 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
         require_links(links)
         articulation, terms = articulate(links, _properties(model), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
+        require_actuators(drives)
         collisions = mjcf_collisions(model)
         actuators = Actuators.from_list(articulation, drives) if drives else None
     return Robot(

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.bounds import require_links
+from pbfd_torch.loading.bounds import require_actuators, require_links
 from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.moments import clipped_moments
 from pbfd_torch.loading.report import listing, naming, warn_not_modelled
@@ -62,6 +62,7 @@ def load_urdf(
         articulation, terms = articulate(links, properties, dtype, device)
         driven = [name for name in articulation.joint_names if name in properties]
         motors = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
+        require_actuators(motors)
         actuators = Actuators.from_list(articulation, motors) if motors else None
     collisions = urdf_collisions(file, articulation, standing, excluded)
     return Robot(

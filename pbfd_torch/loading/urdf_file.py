@@ -18,6 +18,7 @@ from pbfd_torch.loading.xml_file import read_xml, require_finite, require_root
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _WORDS = ("name", "type", "link", "joint", "filename")  # attributes that hold no numbers
 _ENDLESS = ("lower", "upper", "effort", "velocity")  # infinite: there is no limit
+_ONCE = ("inertial", "parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
 _NEEDED = {"axis": "xyz", "mass": "value", "parent": "link", "child": "link", "mesh": "filename"}
 
 
@@ -89,6 +90,9 @@ def _parse(node: Any, kind: Any, path: Path) -> Parsed:
             raise ModelError(f"<{child.tag}> needs the attribute {_NEEDED[child.tag]}")
     if node.tag == "joint" and node.get("type") not in JOINT_TYPES:
         raise ModelError(f"type is '{node.get('type')}': must be one of {', '.join(JOINT_TYPES)}")
+    for tag in _ONCE:
+        if len(node.findall(tag)) > 1:
+            raise ModelError(f"<{tag}> is there {len(node.findall(tag))} times: must be there once")
     for child in node.findall("visual"):
         node.remove(child)
     for child in node.findall("collision/material"):
