@@ -20,6 +20,8 @@ from pbfd_torch.tree.articulation import Articulation, Link
 
 _SMALLEST = 1e-14  # inertia of a joint, relative to the robot's largest, that is a rounding error of zero
 
+_DEPENDENT = 1e-15  # inertia of a joint against those before it, relative to its own, that is a rounding error of zero
+
 
 @dataclass(frozen=True)
 class JointProperties:
@@ -102,7 +104,7 @@ def require_inertia(articulation: Articulation, terms: Sequence[Term] = ()) -> N
         what = "have no mass" if carried == 0 else "have all their mass on the axis and no inertia about it"
         raise ModelError(f"link '{link}' and everything it carries {what}: joint '{joint}' has no inertia")
     size = own.rsqrt()
-    apart = size[:, None] * inertia * size - _SMALLEST * torch.eye(articulation.nv, dtype=articulation.dtype)
+    apart = size[:, None] * inertia * size - _DEPENDENT * torch.eye(articulation.nv, dtype=articulation.dtype)
     dependent = int(torch.linalg.cholesky_ex(apart).info)
     if dependent:
         j = t.dof_joints[dependent - 1]
