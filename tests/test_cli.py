@@ -53,7 +53,7 @@ def test_info_of_a_shipped_robot(pbfd: Pbfd) -> None:
     assert ran.status == 0
     assert ran.out.startswith("hopper: 4 links, 6 degrees of freedom, 3 actuators, 15.82")
     assert re.search(r"^foot_joint +hinge +foot +-0\.7854 … 0\.7854 +1 +1 *$", ran.out, re.MULTILINE)
-    assert "obstacle: floor, HalfSpace at 0 m along [0.0, 0.0, 1.0]\n" in ran.out
+    assert "obstacle: floor, HalfSpace at 0 m along [0, 0, 1]\n" in ran.out
 
 
 def test_info_of_a_urdf(pbfd: Pbfd) -> None:
@@ -68,20 +68,36 @@ def test_info_of_a_urdf(pbfd: Pbfd) -> None:
 
 
 def test_info_lists_what_is_not_modelled(pbfd: Pbfd, tmp_path: Path) -> None:
-    """Everything that Gymnasium's humanoid asks for is modelled, rolling friction is not; long names stay whole in the tables."""
+    """Of Gymnasium's humanoid only numbers of MuJoCo's method, and rolling friction; long names stay whole in the tables."""
     file = gymnasium_file("humanoid")
     data = pbfd("info", file, "--json").data
     assert (data["nv"], data["nu"], len(data["links"])) == (23, 17, 13)
-    assert data["not_modelled"] == []
+    lines = ["attributes of <geom>: margin (1)", "attributes of <option>: integrator (1), iterations (1), solver (1)"]
+    assert data["not_modelled"] == lines
     ran = pbfd("info", file)
     assert (ran.status, ran.err) == (0, "")
-    assert ran.out.endswith("not modelled: nothing\n")
+    assert ran.out.endswith("not modelled:\n" + "".join(f"  {line}\n" for line in lines))
+    assert pbfd("info", "hopper").out.endswith("not modelled: nothing\n")
     ball = tmp_path / "ball.xml"
     ball.write_text("<mujoco><worldbody><body><freejoint/><geom name='g' size='0.1' condim='6'/></body></worldbody></mujoco>")
     line = "torsional and rolling friction (condim 4, 6) (1): g"
     assert pbfd("info", ball, "--json").data["not_modelled"] == [line]
     assert pbfd("info", ball).out.endswith(f"not modelled:\n  {line}\n")
     assert re.search(r"^right_shoulder1 +hinge +right_upper_arm +-1\.484 … 1\.047 ", ran.out, re.MULTILINE)
+
+
+def test_numbers_are_printed_as_people_write_them(pbfd: Pbfd, tmp_path: Path) -> None:
+    """0.1, not 0.10000000149011612."""
+    file = tmp_path / "step.xml"
+    ball = "<body><freejoint/><geom size='0.1'/></body>"
+    world = (
+        f"<option gravity='0 0.1 -9.8'/><worldbody><geom name='step' type='box' size='1 1 1' pos='0.1 0 -1.3'/>{ball}</worldbody>"
+    )
+    file.write_text(f"<mujoco>{world}</mujoco>")
+    out = pbfd("info", file).out
+    assert "obstacle: step, Box at [0.1, 0, -1.3]\n" in out
+    assert "gravity [0, 0.1, -9.8]\n" in out
+    assert pbfd("info", file, "--json").data["obstacles"][0]["position_m"] == [0.1, 0, -1.3]
 
 
 def test_names_are_printed_as_they_are(pbfd: Pbfd, tmp_path: Path) -> None:

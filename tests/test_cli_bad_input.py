@@ -23,7 +23,7 @@ BAD_INPUT: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
     "folder": (("simulate", "folder.xml"), ("folder.xml: is a directory: must be a file",)),
     "empty file": (("simulate", "empty.xml"), ("empty.xml: the file is empty",)),
     "malformed URDF": (("simulate", "broken.urdf"), ("broken.urdf", "malformed XML", "line 1")),
-    "malformed MJCF": (("simulate", "broken.xml"), ("broken.xml", "XML", "Line number=1")),
+    "malformed MJCF": (("simulate", "broken.xml"), ("broken.xml", "XML", "broken.xml:1: malformed XML")),
     "no XML": (("simulate", "noise.xml"), ("noise.xml:1: malformed XML",)),
     "no robot": (("simulate", "page.xml"), ("page.xml: root element is <html>: must be <robot> (URDF) or <mujoco> (MJCF)",)),
     "other extension": (("simulate", "robot.txt"), ("robot.txt: extension '.txt' is not known: must be .urdf, .xml or .mjcf",)),

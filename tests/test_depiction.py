@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from pbfd_torch.loading import load_robot
 from pbfd_torch.loading.scene import robot_scene
+from pbfd_torch.loading.urdf_visuals import urdf_visuals
 from pbfd_torch.models import SCENES, file_setup
 from pbfd_torch.records.depiction import depicted
 
@@ -54,6 +56,18 @@ def test_urdf_visuals(tmp_path: Path) -> None:
     other.unlink()
     with pytest.warns(UserWarning, match="colliders"):
         assert {x.name for x in depicted(gone).visuals} == {"base", "rod_0"}
+
+
+def test_mirrored_visuals_are_not_inside_out(tmp_path: Path) -> None:
+    """Faces of a mesh with a negative scale are counterclockwise seen from outside, as those of all others."""
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.stl")
+    body = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+    for scale in ("1 1 1", "-1 1 1", "1 -2 1", "-1 -1 -1", "-1 -1 1"):
+        visual = f'<visual><geometry><mesh filename="box.stl" scale="{scale}"/></geometry></visual>'
+        (tmp_path / "box.urdf").write_text(f'<robot name="r"><link name="a">{body}{visual}</link></robot>')
+        (seen,) = load_robot(tmp_path / "box.urdf").visuals()
+        urdf_visuals.cache_clear()
+        assert trimesh.Trimesh(seen.vertices, seen.faces).volume == pytest.approx(12 if "-2" in scale else 6), scale
 
 
 def test_mjcf_visuals(tmp_path: Path) -> None:

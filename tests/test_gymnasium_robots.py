@@ -59,7 +59,13 @@ def test_left_to_itself(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_everything_is_modelled(name: str) -> None:
-    """Nothing that these files ask for is left out; the setup has no notes."""
-    assert load_robot(gymnasium_file(name)).not_modelled == ()
-    assert file_setup(gymnasium_file(name)).notes == []
+def test_only_numbers_of_mujocos_method_are_left_out(name: str) -> None:
+    """Whatever moves these robots is modelled; how MuJoCo softens contacts and limits and how it steps is not read."""
+    method = {"integrator", "iterations", "solver", "margin", "solref", "solimp", "solreflimit", "solimplimit"}
+    lines = load_robot(gymnasium_file(name)).not_modelled
+    assert lines
+    for line in lines:
+        of, _, names = line.partition(": ")
+        assert of in {"attributes of <geom>", "attributes of <joint>", "attributes of <option>"}
+        assert {part.split(" ")[0] for part in names.split(", ")} <= method
+    assert file_setup(gymnasium_file(name)).notes == [f"not modelled: {line}" for line in lines]

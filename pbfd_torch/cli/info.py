@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ def _unlimited(robot: Robot) -> list[str]:
 def _obstacle(obstacle: HalfSpace | Obstacle) -> dict[str, Any]:
     if isinstance(obstacle, HalfSpace):
         return {"name": obstacle.name, "shape": "HalfSpace", "normal": list(obstacle.normal), "offset_m": obstacle.offset}
-    position = torch.as_tensor(obstacle.position).tolist()
+    position = torch.as_tensor(obstacle.position, dtype=torch.float64).tolist()
     return {"name": obstacle.name, "shape": type(obstacle.shape).__name__, "position_m": position}
 
 
@@ -98,6 +99,11 @@ def _finite(value: torch.Tensor) -> float | None:
 
 def _coefficient(robot: Robot, kind: type, field: str, dof: int) -> float:
     return sum(float(getattr(term, field)[dof]) for term in robot.joint_terms if isinstance(term, kind))
+
+
+def _written(values: Sequence[float]) -> str:
+    """Numbers as people write them: «[0, 0, -9.81]»."""
+    return f"[{', '.join(f'{x:.6g}' for x in values)}]"
 
 
 def _table(*headers: str) -> Table:
@@ -111,7 +117,7 @@ def _table(*headers: str) -> Table:
 def _print(contents: dict[str, Any]) -> None:
     print(
         f"{contents['name']}: {len(contents['links'])} links, {contents['nv']} degrees of freedom, {contents['nu']} actuators, "
-        f"{contents['mass_kg']:.6g} kg, gravity {contents['gravity_m_s2']}\n"
+        f"{contents['mass_kg']:.6g} kg, gravity {_written(contents['gravity_m_s2'])}\n"
     )
     links = _table("link", "parent", "mass [kg]", "shapes")
     for x in contents["links"]:
@@ -135,9 +141,9 @@ def _print(contents: dict[str, Any]) -> None:
         )
     for obstacle in contents["obstacles"]:
         place = (
-            f"at {obstacle['offset_m']:.4g} m along {obstacle['normal']}"
+            f"at {obstacle['offset_m']:.4g} m along {_written(obstacle['normal'])}"
             if "normal" in obstacle
-            else f"at {obstacle['position_m']}"
+            else f"at {_written(obstacle['position_m'])}"
         )
         print(f"obstacle: {obstacle['name']}, {obstacle['shape']} {place}")
     print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"))

@@ -4,9 +4,7 @@ steps."""
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 
@@ -16,6 +14,7 @@ from pbfd_torch.loading.report import existing_file
 from pbfd_torch.loading.robot import Keyframe, Robot
 from pbfd_torch.loading.srdf import load_srdf_exclusions
 from pbfd_torch.loading.urdf import load_urdf
+from pbfd_torch.loading.xml_file import read_xml
 
 __all__ = ["Keyframe", "Robot", "load_mjcf", "load_robot", "load_srdf_exclusions", "load_urdf"]
 
@@ -31,15 +30,17 @@ def load_robot(
     """Loads a URDF file (.urdf, or .xml with root <robot>) or an MJCF file (.xml or .mjcf with root <mujoco>).
 
     `free_base` and `excluded`, URDF only: see `load_urdf`; an MJCF file says itself what is free and what never touches. Raises
-    `ModelError` naming the file and the element that cannot be used, and `InputError` for these two with MJCF. What the file asks
-    for and the simulation leaves out is in `Robot.not_modelled`, and given as `NotModelledWarning`.
+    `ModelError` naming the file and the element that cannot be used or is too large (`loading.bounds`), and `InputError` for these
+    two with MJCF and for a device that is not there. What the file asks for and the simulation leaves out is in
+    `Robot.not_modelled`, and given as `NotModelledWarning`.
     """
+    _require_device(device)
     file = existing_file(path)
     suffix = file.suffix.lower()
     if suffix not in (".urdf", ".xml", ".mjcf"):
         hint = "; expand it with the xacro command first" if suffix == ".xacro" else ""
         raise ModelError(f"extension '{file.suffix}' is not known: must be .urdf, .xml or .mjcf{hint}", file=str(file))
-    root = "robot" if suffix == ".urdf" else _root_tag(file)
+    root = "robot" if suffix == ".urdf" else read_xml(file).tag
     if root == "robot":
         return load_urdf(file, free_base=free_base, excluded=excluded, dtype=dtype, device=device)
     if root != "mujoco":
@@ -51,9 +52,10 @@ def load_robot(
     return load_mjcf(file, dtype=dtype, device=device)
 
 
-def _root_tag(file: Path) -> str:
+def _require_device(device: torch.device | str) -> None:
+    """Raises `InputError` for a device that is not there, with those that are."""
     try:
-        _, root = next(iter(ElementTree.iterparse(file, events=("start",))))
-    except ElementTree.ParseError as error:
-        raise ModelError(f"malformed XML: {error}", file=f"{file}:{error.position[0]}") from None
-    return str(root.tag)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError):  # as torch was built without it, found none or knows no such name
+        there = ", ".join(["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))])
+        raise InputError(f"device is '{device}': must be one that is there, of {there}") from None

@@ -10,6 +10,8 @@ import torch
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider, ConvexHull, Shape, Solid
+from pbfd_torch.loading.bounds import SLOW_PAIRS, pair_count
+from pbfd_torch.loading.report import announced
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.tree.articulation import Articulation
@@ -41,7 +43,9 @@ def overlapping(
     bodies = place(exact, exact.rest[None]).poses
     closer = bodies.new_full((1, exact.nlink), -0.5 * OVERLAP)
     found: set[tuple[int, int]] = set()
-    for term in contact_terms(exact, colliders, (), ContactRules(friction=None, excluded=excluded)):
+    with announced("overlaps", pair_count(colliders, ()), SLOW_PAIRS):
+        terms = contact_terms(exact, colliders, (), ContactRules(friction=None, excluded=excluded))
+    for term in terms:
         if isinstance(term, BodyContact):
             finder = term.finder
             slots = finder.find(bodies, bodies, closer)

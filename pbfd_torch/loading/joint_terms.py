@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from pbfd_torch.balance.dynamics import mass_matrix
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import COORDINATE, FORCE
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -19,6 +19,8 @@ from pbfd_torch.terms.load import Term
 from pbfd_torch.tree.articulation import Articulation, Link
 
 _SMALLEST = 1e-14  # inertia of a joint, relative to the robot's largest, that is a rounding error of zero
+
+_DEPENDENT = 1e-15  # inertia of a joint against those before it, relative to its own, that is a rounding error of zero
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,15 @@ class JointProperties:
     spring_rest: Sequence[float] = field(default_factory=tuple)  # coordinates; empty: the reference configuration
 
     def check(self, joint: str) -> None:
-        """Raises `ModelError` naming the joint for a number that is negative or not finite."""
+        """Raises `ModelError` naming the joint for a number that is negative, too large or not finite."""
         for what in ("armature", "damping", "stiffness", "dry_friction"):
             value = getattr(self, what)
-            if not (math.isfinite(value) and value >= 0):
-                raise ModelError(f"{what.replace('_', ' ')} is {value}: must be ≥ 0 and finite", element=f"joint '{joint}'")
+            if not 0 <= value <= FORCE:
+                words = f"{what.replace('_', ' ')} is {value}: must be ≥ 0 and at most {FORCE:g}"
+                raise ModelError(words, element=f"joint '{joint}'")
+        if not all(abs(x) <= COORDINATE for x in self.spring_rest):
+            words = f"springs rest at {tuple(self.spring_rest)}: must be within {COORDINATE:g}"
+            raise ModelError(words, element=f"joint '{joint}'")
 
 
 def articulate(
@@ -85,15 +91,24 @@ def joint_limits(articulation: Articulation, actuators: Actuators | None, gravit
 
 def require_inertia(articulation: Articulation, terms: Sequence[Term] = ()) -> None:
     """Raises `ModelError` naming the first joint that can move without moving any mass (at the reference configuration, armatures
-    among `terms` included): its acceleration would not be determined."""
+    among `terms` included), by itself or against those before it: its acceleration would not be determined."""
     t = articulation.topology
     with torch.no_grad():
-        inertia = mass_matrix(articulation, articulation.rest, terms).diagonal()
-    resting = (inertia <= _SMALLEST * inertia.max()).tolist()
-    if not any(resting):
-        return
-    j = t.dof_joints[resting.index(True)]
-    link, joint = t.link_names[t.joint_link[j]], t.joint_names[j]
-    carried = articulation.mass[..., t.subtree[j]].sum()
-    what = "have no mass" if carried == 0 else "have all their mass on the axis and no inertia about it"
-    raise ModelError(f"link '{link}' and everything it carries {what}: joint '{joint}' has no inertia")
+        inertia = mass_matrix(articulation, articulation.rest, terms)
+    own = inertia.diagonal()
+    resting = (own <= _SMALLEST * own.max()).tolist()
+    if any(resting):
+        j = t.dof_joints[resting.index(True)]
+        link, joint = t.link_names[t.joint_link[j]], t.joint_names[j]
+        carried = articulation.mass[..., t.subtree[j]].sum()
+        what = "have no mass" if carried == 0 else "have all their mass on the axis and no inertia about it"
+        raise ModelError(f"link '{link}' and everything it carries {what}: joint '{joint}' has no inertia")
+    size = own.rsqrt()
+    apart = size[:, None] * inertia * size - _DEPENDENT * torch.eye(articulation.nv, dtype=articulation.dtype)
+    dependent = int(torch.linalg.cholesky_ex(apart).info)
+    if dependent:
+        j = t.dof_joints[dependent - 1]
+        raise ModelError(
+            f"joint '{t.joint_names[j]}' can move against those before it so that no mass moves: link "
+            f"'{t.link_names[t.joint_link[j]]}', or what it carries, needs inertia of its own"
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,11 @@ import numpy as np
 
 from pbfd_torch.contact.shapes import ConvexHull, Points
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import TRIANGLES, require_count, require_file_size
+from pbfd_torch.loading.report import first_bytes, naming
 
 MAX_VERTICES = 64
+MESHES = (".stl", ".obj", ".ply", ".dae")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,31 +50,64 @@ class HullLosses:
         return [f"convex hulls are cut to {MAX_VERTICES} vertices ({len(self.metres)}): at most {lost} lost ({worst})"]
 
 
+def require_triangles(file: Path) -> None:
+    """Raises `ModelError` for a mesh file that is too large, before it is read."""
+    require_file_size(file)
+    head = first_bytes(file, 84)
+    if file.suffix.lower() == ".stl" and len(head) == 84:
+        (count,) = struct.unpack("<I", head[80:])
+        if file.stat().st_size == 84 + 50 * count:  # it is not one in text
+            _require_few(file, count)
+
+
+def _require_few(file: Path, triangles: int) -> None:
+    with naming("", f"mesh '{file}'"):
+        require_count("triangles", triangles, TRIANGLES, "simplify it")
+
+
 def load_hull(file: Path, scale: tuple[float, float, float] = (1.0, 1.0, 1.0), max_vertices: int = MAX_VERTICES) -> ReducedHull:
     """Convex hull of a mesh file (STL, OBJ, PLY, COLLADA) in metres, with at most `max_vertices` vertices. Of a COLLADA file the
     unit is applied and the up-axis is not, as everywhere in ROS. Raises `ModelError` for a file that holds no usable mesh."""
     vertices: Points = np.asarray(read_mesh(file).vertices, np.float64)
-    if not np.isfinite(vertices).all() or not np.isfinite(scale).all():
-        raise ModelError(f"mesh '{file}': vertices and scale must be finite")
+    if not np.isfinite(scale).all():
+        raise ModelError(f"mesh '{file}': scale is {scale}: must be finite")
     return reduced_hull(vertices * np.array(scale), max_vertices, name=str(file))
 
 
 def read_mesh(file: Path) -> Any:
     """All parts of a mesh file as one `trimesh.Trimesh` in metres; see `load_hull`."""
-    import trimesh
 
+    if file.suffix.lower() not in MESHES:
+        raise ModelError(f"mesh '{file}': extension must be one of {', '.join(MESHES)}")
+    require_triangles(file)
     if file.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
         raise ModelError(f"mesh '{file}': reading COLLADA files needs the package pycollada (pip install pycollada)")
     try:
-        scene: Any = trimesh.load_scene(file, process=False, skip_materials=True)
-        parts = [
-            scene.geometry[name].copy().apply_transform(matrix)
-            for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
-        ]
+        whole = _joined(file)
+    except ModelError:
+        raise
     except Exception as error:  # trimesh raises whatever its readers raise
         raise ModelError(f"mesh '{file}' cannot be read: {error}") from error
+    vertices, faces = np.asarray(whole.vertices), np.asarray(whole.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
+        raise ModelError(f"mesh '{file}': vertices must be finite, three numbers each")
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise ModelError(f"mesh '{file}': faces name vertices {faces.min()} to {faces.max()}: must be 0 to {len(vertices) - 1}")
+    return whole
+
+
+def _joined(file: Path) -> Any:
+    """As trimesh reads it."""
+    import trimesh
+
+    scene: Any = trimesh.load_scene(file, process=False, skip_materials=True)
+    parts = [
+        scene.geometry[name].copy().apply_transform(matrix)
+        for matrix, name in (scene.graph[node] for node in scene.graph.nodes_geometry)
+    ]
     if not sum(len(part.vertices) for part in parts):
         raise ModelError(f"mesh '{file}' holds no vertices")
+    _require_few(file, sum(len(getattr(part, "faces", ())) for part in parts))
     whole: Any = trimesh.util.concatenate([trimesh.Trimesh(x.vertices, getattr(x, "faces", None), process=False) for x in parts])
     return whole.apply_scale(_collada_unit(file)) if file.suffix.lower() == ".dae" else whole
 
@@ -147,14 +184,21 @@ def _distance(points: Points, triangles: Points) -> float:
 def find_mesh(filename: str, robot_file: Path) -> Path:
     """The file that a URDF means by `package://NAME/PATH`, `file://…` or a path relative to itself. A package is looked for above
     the robot file and in ROS_PACKAGE_PATH. Raises `ModelError` saying where it looked."""
+    try:
+        places = _places(filename, robot_file)
+        found = next((place for place in places if place.is_file()), None)
+    except (ValueError, OSError) as error:  # is no address, holds a zero byte, or is too long for a name
+        shown = filename if len(filename) <= 60 else f"{filename[:60]}…"
+        raise ModelError(f"mesh '{shown}' cannot be looked for: {getattr(error, 'strerror', None) or error}") from None
+    if found is None:
+        raise ModelError(f"mesh '{filename}' not found; looked at {', '.join(map(str, places))}")
+    return found
+
+
+def _places(filename: str, robot_file: Path) -> list[Path]:
     url = urlparse(filename)
     if url.scheme in ("package", "model"):
         inside = unquote(url.path).lstrip("/")
         roots = [*robot_file.absolute().parents, *(Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p)]
-        places = [root / inside for root in roots if root.name == url.netloc] + [root / url.netloc / inside for root in roots]
-    else:
-        places = [robot_file.absolute().parent / (unquote(url.path) if url.scheme == "file" else filename)]
-    for place in places:
-        if place.is_file():
-            return place
-    raise ModelError(f"mesh '{filename}' not found; looked at {', '.join(map(str, places))}")
+        return [root / inside for root in roots if root.name == url.netloc] + [root / url.netloc / inside for root in roots]
+    return [robot_file.absolute().parent / (unquote(url.path) if url.scheme == "file" else filename)]

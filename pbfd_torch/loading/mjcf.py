@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import require_actuators, require_link_count, require_links
 from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
 from pbfd_torch.loading.mjcf_actuators import drive_properties, mjcf_actuators
 from pbfd_torch.loading.mjcf_colliders import mjcf_collisions
@@ -29,17 +30,22 @@ def load_mjcf(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float6
 
     Geoms that can collide become colliders, those fixed to the world obstacles. Meshes become their convex hulls; a height field
     goes on beyond its border and has no bottom. Who touches whom is as in MuJoCo (contype, conaffinity, <exclude>, <pair>; not a
-    body and its parent), also where shapes overlap. A geom with condim 1 is frictionless. Numbers of MuJoCo's own method (time
-    step, integrator, solver, solref, solimp, margin) are not read. Raises `ModelError` with MuJoCo's own words, or naming the
-    element that cannot be used.
+    body and its parent), also where shapes overlap. A geom with condim 1 is frictionless. The time step is that of each run. Other
+    numbers of MuJoCo's own method (integrator, solver, solref, solimp, margin) are not read, and named in `Robot.not_modelled`.
+    Raises `ModelError` with MuJoCo's own words, or naming the element that cannot be used, is too large (`loading.bounds`) or not
+    finite.
     """
     model = compile_mjcf(Path(path))
     with naming(str(path)):
         gravity = _gravity(model)
-        articulation, terms = articulate(_links(model), _properties(model), dtype, device)
+        require_link_count(model.data.nbody - 1, model.data.nv)
+        links = _links(model)
+        require_links(links)
+        articulation, terms = articulate(links, _properties(model), dtype, device)
         drives, controls, idle = mjcf_actuators(model)
+        require_actuators(drives)
         collisions = mjcf_collisions(model)
-    actuators = Actuators.from_list(articulation, drives) if drives else None
+        actuators = Actuators.from_list(articulation, drives) if drives else None
     return Robot(
         name=model.name,
         articulation=articulation,

@@ -10,10 +10,11 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Shape, Solid, Sphere
+from pbfd_torch.loading.bounds import SHAPES, require_count, require_near, require_shapes, require_size
 from pbfd_torch.loading.collisions import Collisions, as_solid
 from pbfd_torch.loading.meshes import HullLosses, reduced_hull
 from pbfd_torch.loading.mjcf_model import CompiledModel
-from pbfd_torch.loading.report import listing, naming
+from pbfd_torch.loading.report import listing, naming, progress
 
 _PAIR_BIT = 32  # MuJoCo's bits of contype and conaffinity end below
 
@@ -50,7 +51,7 @@ class _Reader:
         obstacles: dict[int, HalfSpace | Obstacle] = {}
         odd = []
         paired = {g for pair in model.pairs for g in pair}
-        for g in range(m.ngeom):
+        for g in progress(range(m.ngeom), "geoms"):
             if not (m.geom_contype[g] or m.geom_conaffinity[g] or g in paired):
                 continue
             with naming(str(model.path), f"geom '{model.geom(g)}'"):
@@ -61,6 +62,8 @@ class _Reader:
                     obstacles[g] = found
                 else:
                     odd.append(f"{model.geom(g)} ({model.geom_type(g)})")
+                require_count("shapes", len(colliders) + len(obstacles), 2 * SHAPES, "simplify what collides")
+        require_shapes(colliders, tuple(obstacles.values()))
         lines = losses.lines()
         if odd:
             lines.append(f"geoms that cannot collide: {listing(odd)}")
@@ -101,6 +104,7 @@ class _Reader:
         shape = self._shape(g, losses)
         if shape is None:
             return None
+        require_size(shape, m.geom_pos[g].tolist(), moving=True)
         return Collider(
             name=model.geom(g),
             link=model.body(int(m.geom_bodyid[g])),
@@ -114,6 +118,7 @@ class _Reader:
         model = self.model
         position, turn = model.placed.geom_xpos[g], model.placed.geom_xmat[g].reshape(3, 3)
         kind, name, touching = model.geom_type(g), self._obstacle_name(g), self._touching(g)
+        require_near("position", position.tolist(), "")
         if kind == "plane":
             normal = turn[:, 2]
             return HalfSpace(name=name, normal=tuple(normal.tolist()), offset=float(normal @ position), **touching)
@@ -121,6 +126,7 @@ class _Reader:
         solid: Solid | None = self._height_field(g) if kind == "hfield" else None if shape is None else as_solid(shape)
         if solid is None:
             return None
+        require_size(solid, position.tolist(), moving=False)
         return Obstacle(name, solid, tuple(position.tolist()), model.geom_quaternion(g), **touching)
 
     def _obstacle_name(self, g: int) -> str:

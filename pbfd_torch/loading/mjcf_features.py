@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbfd_torch.loading.mjcf_model import CompiledModel, label
+from pbfd_torch.loading.mjcf_unread import unread
 from pbfd_torch.loading.report import listing
 
 
@@ -17,6 +18,7 @@ def left_out(model: CompiledModel) -> Iterator[str]:
     yield from _of_constraints(model)
     yield from _of_joints(model)
     yield from _of_contacts(model)
+    yield from unread(model.sources)
 
 
 def _named(what: str, names: list[str]) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.mjcf_file import Source, mjcf_sources, require_compilable
 from pbfd_torch.loading.report import existing_file
+from pbfd_torch.loading.xml_file import require_root
 from pbfd_torch.tree.rotations import quaternion_matrix
 
 
@@ -28,10 +30,11 @@ def label(enum: str, value: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CompiledModel:
-    """`data`: MuJoCo's MjModel. `keyframe_count`: of those that the file has; the model may hold more, empty ones. Elements
-    without a name are called by what they are and their number: «joint3»."""
+    """`sources`: the files that it was made of. `data`: MuJoCo's MjModel. `keyframe_count`: of those that the file has; the model
+    may hold more, empty ones. Elements without a name are called by what they are and their number: «joint3»."""
 
     path: Path
+    sources: Sequence[Source]
     name: str
     data: Any
     keyframe_count: int
@@ -134,15 +137,19 @@ class CompiledModel:
 
 
 def compile_mjcf(path: Path) -> CompiledModel:
-    """Raises `ModelError` with MuJoCo's words on what it does not accept, and passes its warnings on as Python's."""
+    """Raises `ModelError` for what is too large or not finite, and with MuJoCo's words on what it does not accept. Passes MuJoCo's
+    warnings on as Python's."""
     import mujoco
 
     file = existing_file(path)
+    sources = mjcf_sources(file)
+    require_root(sources[0].root, "mujoco", file)
+    require_compilable(sources)
     try:
         with _warnings_of(file):
             spec = mujoco.MjSpec.from_file(str(file))
             keyframe_count = len(spec.keys)  # compiling adds empty ones
-            return CompiledModel(file, spec.modelname, spec.compile(), keyframe_count)
+            return CompiledModel(file, sources, spec.modelname, spec.compile(), keyframe_count)
     except ValueError as error:
         words = "; ".join(line.strip().rstrip(":") for line in str(error).splitlines() if line.strip())
         raise ModelError(words, file=str(file)) from None

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
+
+from tqdm import tqdm
 
 from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
+
+T = TypeVar("T")
 
 
 def existing_file(path: str | os.PathLike[str]) -> Path:
@@ -27,6 +33,12 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     return file
 
 
+def first_bytes(file: Path, count: int) -> bytes:
+    """At most so many."""
+    with file.open("rb") as stream:
+        return stream.read(count)
+
+
 @contextmanager
 def naming(file: str, element: str = "") -> Iterator[None]:
     """Adds the file, and where it is missing the element, to errors raised inside."""
@@ -43,6 +55,22 @@ def listing(names: Iterable[str], most: int = 5) -> str:
     every = list(names)
     rest = len(every) - most
     return ", ".join(every) if rest <= 1 else f"{', '.join(every[:most])} and {rest} more"
+
+
+def progress(items: Sequence[T], what: str) -> Iterable[T]:
+    """The items, with a bar on a terminal once they have taken a second."""
+    return tqdm(items, desc=what, delay=1.0, leave=False) if sys.stderr.isatty() else items
+
+
+@contextmanager
+def announced(what: str, count: int, slow_from: int) -> Iterator[None]:
+    """Says on a terminal what is being done to so many, from as many on as take more than a second."""
+    if count < slow_from or not sys.stderr.isatty():
+        yield
+        return
+    with tqdm(total=count, desc=what, leave=False) as bar:
+        yield
+        bar.update(count)
 
 
 def warn_not_modelled(file: Path, lines: Sequence[str]) -> tuple[str, ...]:

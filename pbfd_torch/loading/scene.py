@@ -11,6 +11,8 @@ import torch
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Curved
+from pbfd_torch.loading.bounds import SLOW_PAIRS, pair_count
+from pbfd_torch.loading.report import announced
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.scene import Scene
 from pbfd_torch.terms.contact import Contact
@@ -45,7 +47,8 @@ def robot_scene(
     rules = ContactRules(firm, excluded=excluded, actuators=robot.actuators)
     if friction is not None:
         rules = dataclasses.replace(rules, friction=friction)
-    terms += contact_terms(articulation, robot.colliders, obstacles, rules)
+    with announced("contacts", pair_count(robot.colliders, obstacles), SLOW_PAIRS):
+        terms += contact_terms(articulation, robot.colliders, obstacles, rules)
     gravity = torch.tensor(robot.gravity, dtype=articulation.dtype, device=articulation.device)
     return Scene(articulation, tuple(terms), gravity, robot.colliders, obstacles, robot.name, robot.visuals)
 

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.report import existing_file
+from pbfd_torch.loading.xml_file import read_xml, require_finite, require_root
+
+_WORDS = ("name", "link", "link1", "link2", "reason", "base_link", "tip_link", "parent_link", "child_link", "group", "joint")
 
 
 def load_srdf_exclusions(path: str | os.PathLike[str]) -> tuple[tuple[str, str], ...]:
     """The pairs of links that an SRDF file keeps from touching (<disable_collisions link1="…" link2="…"/>), for `excluded` of
     `load_urdf`. Raises `ModelError` for malformed XML, another root than <robot> or a pair without two names."""
-    from lxml import etree
-
-    file = existing_file(path)
-    try:
-        root = etree.parse(file).getroot()
-    except etree.XMLSyntaxError as error:
-        raise ModelError(f"malformed XML: {error.msg}", file=f"{file}:{error.lineno}") from None
-    if root.tag != "robot":
-        raise ModelError(f"root element is <{root.tag}>: must be <robot>", file=f"{file}:{root.sourceline}")
+    file = Path(path)
+    root = read_xml(file)
+    require_root(root, "robot", file)
+    require_finite(root, file, words=_WORDS, endless=())
     pairs = []
     for node in root.iter("disable_collisions"):
         one, other = node.get("link1"), node.get("link2")

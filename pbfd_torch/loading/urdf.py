@@ -14,7 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import ModelError
+from pbfd_torch.loading.bounds import require_actuators, require_links
 from pbfd_torch.loading.joint_terms import JointProperties, articulate, joint_limits
+from pbfd_torch.loading.moments import clipped_moments
 from pbfd_torch.loading.report import listing, naming, warn_not_modelled
 from pbfd_torch.loading.robot import Robot
 from pbfd_torch.loading.urdf_colliders import urdf_collisions
@@ -52,13 +54,16 @@ def load_urdf(
     with naming(str(path)):
         root, order = _tree(file)
         free = _has_free_base(file, root, order) if free_base is None else free_base
-        links, standing = _links(file, root, order, free)
+        given, standing = _links(file, root, order, free)
+        require_links(given)
+        links, clipped = clipped_moments(given)
         joints = [x.data for x in file.joints.values()]
         properties = {j.name: _properties(j) for j in joints if j.type in ("revolute", "continuous", "prismatic")}
         articulation, terms = articulate(links, properties, dtype, device)
         driven = [name for name in articulation.joint_names if name in properties]
         motors = [Actuator.motor(name, name, effort=_effort(file.joints[name].data)) for name in driven]
-    actuators = Actuators.from_list(articulation, motors) if motors else None
+        require_actuators(motors)
+        actuators = Actuators.from_list(articulation, motors) if motors else None
     collisions = urdf_collisions(file, articulation, standing, excluded)
     return Robot(
         name=file.name,
@@ -70,7 +75,7 @@ def load_urdf(
         excluded=collisions.excluded,
         gravity=_GRAVITY,
         visuals=functools.partial(urdf_visuals, file.path.absolute(), articulation.link_names),
-        not_modelled=warn_not_modelled(file.path, [*_ignored(joints), *file.left_out, *collisions.left_out]),
+        not_modelled=warn_not_modelled(file.path, [*clipped, *_ignored(joints), *file.left_out, *collisions.left_out]),
     )
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Shape, Sphere
 from pbfd_torch.errors import InputError
+from pbfd_torch.loading.bounds import SHAPES, require_count, require_shapes, require_size
 from pbfd_torch.loading.collisions import Collisions, as_solid, overlapping
 from pbfd_torch.loading.meshes import HullLosses, find_mesh, load_hull
-from pbfd_torch.loading.report import listing, naming
+from pbfd_torch.loading.report import listing, naming, progress
 from pbfd_torch.loading.urdf_file import UrdfFile
 from pbfd_torch.loading.urdf_placement import Placed
 from pbfd_torch.tree.articulation import Articulation
@@ -30,12 +31,20 @@ def urdf_collisions(
         if name not in file.links:
             raise InputError(f"excluded pairs name '{name}': the links are {listing(file.links, 20)}")
     losses = HullLosses()
-    shapes = [collider for link in articulation.link_names for collider in _colliders(file, link, losses)]
+    count = sum(len(link.data.collisions) for link in file.links.values())
+    with naming(str(file.path)):
+        require_count("collision shapes", count, 2 * SHAPES, "simplify what collides")
+    links = progress(articulation.link_names, "collision shapes")
+    shapes = [collider for link in links for collider in _colliders(file, link, losses, link not in standing)]
     joints = [x.data for x in file.joints.values()]
     joined = [(x.parent, x.child) for x in joints if x.parent in standing and x.child not in standing]
+    moving = [x for x in shapes if x.link not in standing]
+    flat = [x for x in shapes if x.link in standing and _flat(x.shape)]
+    obstacles = [_obstacle(x, standing[x.link]) for x in shapes if x.link in standing and x not in flat]
+    with naming(str(file.path)):
+        require_shapes(moving, obstacles)
     apart = tuple(dict.fromkeys((*excluded, *joined)))
     overlaps = overlapping(articulation, shapes, apart)
-    flat = [x for x in shapes if x.link in standing and _flat(x.shape)]
     lines = losses.lines()
     if flat:
         lines.append(f"flat shapes of links fixed to the world are no obstacles ({len(flat)}): {listing(x.name for x in flat)}")
@@ -43,20 +52,21 @@ def urdf_collisions(
         pairs = listing((f"{a} and {b}" for a, b in overlaps), 3)
         lines.append(f"contact of links that overlap in the rest configuration ({len(overlaps)}): {pairs}")
     return Collisions(
-        colliders=tuple(x for x in shapes if x.link not in standing),
-        obstacles=tuple(_obstacle(x, standing[x.link]) for x in shapes if x.link in standing and x not in flat),
+        colliders=tuple(moving),
+        obstacles=tuple(obstacles),
         excluded=apart + overlaps,
         left_out=tuple(lines),
     )
 
 
-def _colliders(file: UrdfFile, link: str, losses: HullLosses) -> list[Collider]:
+def _colliders(file: UrdfFile, link: str, losses: HullLosses, moving: bool) -> list[Collider]:
     parsed, found = file.links[link], []
     for k, (collision, given) in enumerate(zip(parsed.data.collisions, parsed.collision_names, strict=True)):
         name = given or f"{link}_{k}"
         place = Placed.from_origin(collision.origin)
         with naming(parsed.place, f"link '{link}', collision '{name}'"):
             shape = _shape(collision.geometry, file, losses)
+            require_size(shape, place.position, moving)
             found.append(Collider(name, link, shape, place.position, place.quaternion))
     return found
 

@@ -11,9 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from pbfd_torch.errors import ModelError
-from pbfd_torch.loading.report import existing_file, naming
+from pbfd_torch.loading.bounds import require_link_count
+from pbfd_torch.loading.report import naming
+from pbfd_torch.loading.xml_file import read_xml, require_finite, require_root
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_WORDS = ("name", "type", "link", "joint", "filename")  # attributes that hold no numbers
+_ENDLESS = ("lower", "upper", "effort", "velocity")  # infinite: there is no limit
+_ONCE = ("inertial", "parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
 _NEEDED = {"axis": "xyz", "mass": "value", "parent": "link", "child": "link", "mesh": "filename"}
 
 
@@ -41,7 +46,9 @@ def read_urdf(path: Path) -> UrdfFile:
     """Raises `ModelError` naming file, line and element for what is malformed, misses an attribute or has a name twice."""
     from pytorch_kinematics.urdf_parser_py import urdf
 
-    root = root_of(existing_file(path))
+    root = root_of(path)
+    with naming(str(path)):
+        require_link_count(len(root.findall("link")))
     file = UrdfFile(path, root.get("name", path.stem))
     others: Counter[str] = Counter()
     with complaints() as heard:
@@ -63,18 +70,15 @@ def read_urdf(path: Path) -> UrdfFile:
 
 
 def root_of(path: Path) -> Any:
-    """The <robot> element; raises `ModelError` for what is none."""
-    from lxml import etree
-
-    try:
-        root = etree.parse(path, etree.XMLParser(remove_comments=True, remove_pis=True)).getroot()
-    except etree.XMLSyntaxError as error:
-        raise ModelError(f"malformed XML: {error.msg}", file=f"{path}:{error.lineno}") from None
-    if root.tag != "robot":
-        raise ModelError(f"root element is <{root.tag}>: must be <robot>", file=f"{path}:{root.sourceline}")
+    """The <robot> element; raises `ModelError` for what is none, and for numbers that are not finite."""
+    root = read_xml(path)
+    require_root(root, "robot", path)
     for node in root.iter("{*}*"):
         if node.prefix == "xacro":
             raise ModelError("holds xacro macros: expand it with the xacro command first", file=f"{path}:{node.sourceline}")
+    for part in ("link", "joint", "material"):
+        for node in root.findall(part):
+            require_finite(node, path, _WORDS, _ENDLESS)
     return root
 
 
@@ -84,12 +88,11 @@ def _parse(node: Any, kind: Any, path: Path) -> Parsed:
     for child in list(node.iter(*_NEEDED)):
         if child.get(_NEEDED[child.tag]) is None:
             raise ModelError(f"<{child.tag}> needs the attribute {_NEEDED[child.tag]}")
-    for child in node.iter():
-        for key, value in child.attrib.items():
-            if key != "name" and "nan" in value.lower().split():
-                raise ModelError(f"{key} of <{child.tag}> is '{value}': must be numbers")
     if node.tag == "joint" and node.get("type") not in JOINT_TYPES:
         raise ModelError(f"type is '{node.get('type')}': must be one of {', '.join(JOINT_TYPES)}")
+    for tag in _ONCE:
+        if len(node.findall(tag)) > 1:
+            raise ModelError(f"<{tag}> is there {len(node.findall(tag))} times: must be there once")
     for child in node.findall("visual"):
         node.remove(child)
     for child in node.findall("collision/material"):

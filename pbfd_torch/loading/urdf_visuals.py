@@ -12,7 +12,6 @@ import numpy as np
 
 from pbfd_torch.errors import ModelError
 from pbfd_torch.loading.meshes import find_mesh, read_mesh
-from pbfd_torch.loading.report import existing_file
 from pbfd_torch.loading.urdf_colliders import primitive
 from pbfd_torch.loading.urdf_file import complaints, root_of
 from pbfd_torch.loading.urdf_placement import Placed
@@ -25,7 +24,7 @@ def urdf_visuals(path: Path, links: Sequence[str]) -> tuple[Visual, ...]:
     """Of the links of these names, in this order. A visual that cannot be read is left out with a warning."""
     from pytorch_kinematics.urdf_parser_py import urdf, xml_reflection
 
-    root = root_of(existing_file(path))
+    root = root_of(path)
     named = {x.get("name"): x for x in root.findall("material")}
     found = []
     with complaints():
@@ -35,10 +34,10 @@ def urdf_visuals(path: Path, links: Sequence[str]) -> tuple[Visual, ...]:
             k = links.index(link.get("name"))
             for number, node in enumerate(link.findall("visual")):
                 name = node.attrib.pop("name", f"{links[k]}_{number}")
-                color = _color(node.find("material"), named) or link_color(k)
-                for material in node.findall("material"):
-                    node.remove(material)
                 try:
+                    color = _color(node.find("material"), named) or link_color(k)
+                    for material in node.findall("material"):
+                        node.remove(material)
                     visual = urdf.Visual.from_xml(node, xml_reflection.core.Path("visual"))
                     found.append(_visual(visual, name, k, color, path))
                 except Exception as error:  # a picture must not stop a simulation; the parser and trimesh raise whatever they like
@@ -53,7 +52,9 @@ def _visual(visual: Any, name: str, link: int, color: Color, path: Path) -> Visu
     shape: Any = primitive(visual.geometry)
     if shape is None:
         mesh = read_mesh(find_mesh(visual.geometry.filename, path))
-        shape = trimesh.Trimesh(mesh.vertices * np.array(visual.geometry.scale or (1.0, 1.0, 1.0)), mesh.faces, process=False)
+        scale = np.array(visual.geometry.scale or (1.0, 1.0, 1.0))
+        faces = mesh.faces[:, :: 1 if scale.prod() > 0 else -1]  # a mirrored mesh would be inside out
+        shape = trimesh.Trimesh(mesh.vertices * scale, faces, process=False)
     return visual_of(name, link, shape, place.position, place.quaternion, color)
 
 
