@@ -7,7 +7,10 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @contextmanager
@@ -33,3 +36,9 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
     """A text (in UTF-8) or bytes as a `whole_file`."""
     with whole_file(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """A picture as a `whole_file`, of the kind that its name ends in."""
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix.removeprefix("."))

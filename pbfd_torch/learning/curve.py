@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-import os
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
+
+from pbfd_torch.files import write_figure, write_whole
 
 
 @dataclass(frozen=True)
@@ -57,14 +59,13 @@ def of_episodes(returns: Tensor, lengths: Tensor) -> dict[str, Any]:
 
 def save(rows: Sequence[Row], path: Path) -> None:
     """The whole curve, or the old file stays."""
-    part = path.with_suffix(".part")
-    with part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(Row.__dataclass_fields__))
-        writer.writeheader()
-        writer.writerows(
-            {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in asdict(r).items()} for r in rows
-        )
-    os.replace(part, path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(Row.__dataclass_fields__))
+    writer.writeheader()
+    writer.writerows(
+        {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in asdict(r).items()} for r in rows
+    )
+    write_whole(path, text.getvalue())
 
 
 def load(path: Path) -> list[Row]:
@@ -114,4 +115,4 @@ def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="upper left")
-    figure.savefig(path)
+    write_figure(path, figure)

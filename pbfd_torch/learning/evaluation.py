@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pbfd_torch.envs import PbfdEnv, Step
+from pbfd_torch.files import write_figure
 from pbfd_torch.learning.folder import load_checkpoint
 from pbfd_torch.learning.networks import make_actor, mean_action
 from pbfd_torch.learning.track import tracked
@@ -131,4 +132,4 @@ def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:
     axis.set(ylabel="return, mean and standard deviation over episodes")
     axis.grid(axis="y", alpha=0.3)
     axis.legend(title="evaluated on", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.savefig(path)
+    write_figure(path, figure)

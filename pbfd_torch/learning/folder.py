@@ -5,8 +5,6 @@ Beside the last checkpoint there is the best: the one at which the mean return o
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -16,6 +14,7 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import whole_file
 from pbfd_torch.learning import curve
 
 FORMAT = "pbfd_torch policy 1"
@@ -56,24 +55,20 @@ class Folder:
 
     def write(self, settings: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
         """Everything there is to go on with. `settings` holds those of the environment under "env", and the networks' "width"."""
-        part = self.path / f"{CHECKPOINT}.part"
-        torch.save(
-            {
-                "format": FORMAT,
-                "method": self.method,
-                "settings": dict(settings),
-                "rows": [asdict(row) for row in self.rows],
-                "seconds": self.seconds,
-                "random": torch.get_rng_state(),
-                **parts,
-            },
-            part,
-        )
+        content = {
+            "format": FORMAT,
+            "method": self.method,
+            "settings": dict(settings),
+            "rows": [asdict(row) for row in self.rows],
+            "seconds": self.seconds,
+            "random": torch.get_rng_state(),
+            **parts,
+        }
         means = [x for x in curve.trailing(self.rows) if not math.isnan(x)]
-        if means and means[-1] > max(means[:-1], default=-math.inf):
-            shutil.copyfile(part, self.path / f"{BEST}.part")
-            os.replace(self.path / f"{BEST}.part", self.path / BEST)
-        os.replace(part, self.path / CHECKPOINT)
+        best = means and means[-1] > max(means[:-1], default=-math.inf)
+        for name in (BEST, CHECKPOINT) if best else (CHECKPOINT,):
+            with whole_file(self.path / name) as file:
+                torch.save(content, file)
         curve.save(self.rows, self.path / CURVE)
         if time.monotonic() - self._drawn > PICTURE_EVERY:
             self.draw()

@@ -1,0 +1,101 @@
+"""What numbers the command's options take: each range is declared once, here, and checked as the option is read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import typer
+
+from pbfd_torch import memory
+from pbfd_torch.errors import InputError
+from pbfd_torch.stepping.stepper import SHORTEST_STEP
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from `low` to `high`, in a `unit`. Nothing that is not finite is within."""
+
+    low: float
+    high: float = math.inf
+    unit: str = ""
+
+    @property
+    def words(self) -> str:
+        return f"from {_text(self.low)} to {_text(self.high)}" if math.isfinite(self.high) else f"≥ {_text(self.low)} and finite"
+
+    def check(self, name: str, value: float) -> None:
+        """Raises `InputError` naming the option, its value and the range."""
+        if not (math.isfinite(value) and self.low <= value <= self.high):
+            unit = f" {self.unit}" if self.unit else ""
+            raise InputError(f"{name} is {_text(value)}{unit}: must be {self.words}")
+
+    def option(self, help: str, *names: str) -> Any:  # noqa: A002  (typer's own name)
+        """An option, or a pair of numbers, that takes such numbers; None where it is left out."""
+        return typer.Option(*names, help=f"{help} Must be {self.words}.", callback=_checked(self.check))
+
+
+class WorldsRange:
+    """As many worlds as memory has room for, as far as that can be known before the scene is."""
+
+    @property
+    def most(self) -> int:
+        return max(1, memory.share() // LEAST_OF_A_WORLD)
+
+    def check(self, name: str, value: float) -> None:
+        """See `Range`."""
+        if not 1 <= value <= self.most:
+            raise InputError(
+                f"{name} is {value}: must be from 1 to {self.most}, which have {LEAST_OF_A_WORLD // 1024} KiB each "
+                f"in half of the memory that is available, {memory.gibibytes(memory.share())}"
+            )
+
+    def option(self, help: str, *names: str) -> Any:  # noqa: A002  (typer's own name)
+        """See `Range`."""
+        return typer.Option(*names, help=f"{help} Must be ≥ 1; memory says how many.", callback=_checked(self.check))
+
+
+def _checked(check: Callable[[str, float], None]) -> Callable[..., Any]:
+    def checked(param: typer.CallbackParam, value: Any) -> Any:
+        for number in value if isinstance(value, list | tuple) else (value,):
+            if number is not None:
+                check(max(param.opts, key=len), number)
+        return value
+
+    return checked
+
+
+def _text(value: float) -> str:
+    """Integers with all their digits."""
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+LEAST_OF_A_WORLD = 2**14  # [bytes] that a world of one free body takes at least while it is stepped
+
+WORLDS = WorldsRange()
+STEP = Range(SHORTEST_STEP, unit="s")
+DURATION = Range(SHORTEST_STEP, unit="s")
+ACCURACY = Range(1e-9, 1.0, "m")
+CONTROL_STEP = Range(SHORTEST_STEP, 1.0, "s")
+SEED = Range(0, 2**64 - 1)
+PROCESSES = Range(1, 256)
+COLLECTORS = Range(0, 256)
+THREADS = Range(1, 256)
+PORT = Range(1, 65535)
+FRAMES = Range(1, 10**12)
+MINUTES = Range(1e-3, 10**6, "min")
+ITERATIONS = Range(1, 10**6)
+FACTOR = Range(1e-3, 1e3)
+FRICTION_FACTOR = Range(0, 1e3)
+FORCE = Range(0, 1e6, "N")
+FRAME = Range(0, 10**9)
+SIDE_BY_SIDE = Range(1, 64)
+
+MEASURED_STEP = Range(SHORTEST_STEP, 0.1, "s")  # up to the paper's largest
+MEASURED_STEPS = Range(1, 10_000)
+MEASURED_WORLDS = Range(1, 4096)
+MEASURED_SECONDS = Range(1e-3, 1e5, "s")
+REPEATS = Range(1, 1000)
+TRAJECTORY = Range(0.1, 60, "s")
