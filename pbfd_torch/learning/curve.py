@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import reprlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,7 +16,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from pbfd_torch.errors import InputError
 from pbfd_torch.files import write_figure, write_whole
+from pbfd_torch.learning.numbers import require_integer
+
+_COUNTS = ("frames", "episodes")
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,23 @@ def load(path: Path) -> list[Row]:
         return [_row(row) for row in csv.DictReader(file)]
 
 
+def rows_of(saved: object) -> list[Row]:
+    """The rows that `asdict` has made plain. Raises `InputError` naming the row and the entry that are none."""
+    if not isinstance(saved, list):
+        raise InputError(f"rows is {reprlib.repr(saved)}: must be a list")
+    for k, row in enumerate(saved):
+        if not isinstance(row, dict) or set(row) != set(Row.__dataclass_fields__):
+            raise InputError(f"rows[{k}] is {reprlib.repr(row)}: must have the entries {', '.join(Row.__dataclass_fields__)}")
+        for name, value in row.items():
+            if name in _COUNTS:
+                require_integer(f"rows[{k}].{name}", value, 0, 2**63 - 1)
+            elif not isinstance(value, float):  # NaN where there is nothing to average
+                raise InputError(f"rows[{k}].{name} is {reprlib.repr(value)}: must be a number")
+    return [Row(**row) for row in saved]
+
+
 def _row(row: Mapping[str, str]) -> Row:
-    numbers: dict[str, Any] = {k: int(v) if k in ("frames", "episodes") else float(v) for k, v in row.items()}
+    numbers: dict[str, Any] = {k: int(v) if k in _COUNTS else float(v) for k, v in row.items()}
     return Row(**numbers)
 
 

@@ -16,8 +16,8 @@ import torch
 from pbfd_torch.errors import InputError
 from pbfd_torch.files import whole_file
 from pbfd_torch.learning import curve
+from pbfd_torch.learning.checkpoint import FORMAT, load_checkpoint
 
-FORMAT = "pbfd_torch policy 1"
 PICTURE_EVERY = 30.0  # [s]
 CHECKPOINT, BEST, CURVE, PICTURE = "checkpoint.pt", "best.pt", "curve.csv", "curve.png"
 
@@ -39,9 +39,12 @@ class Folder:
             self.saved = load_checkpoint(checkpoint)
             if self.saved["method"] != method:
                 raise InputError(f"'{path}' holds a training by {self.saved['method']}: go on with that, or choose another folder")
-            self.rows = [curve.Row(**row) for row in self.saved["rows"]]
+            self.rows = curve.rows_of(self.saved["rows"])
             self.seconds = self.saved["seconds"]
-            torch.set_rng_state(self.saved["random"])
+            try:
+                torch.set_rng_state(self.saved["random"])
+            except RuntimeError as error:
+                raise InputError(f"'{checkpoint}' is not a usable checkpoint: random is no state of torch's generator") from error
         path.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -77,18 +80,3 @@ class Folder:
         """The picture of the curve so far: takes longer than the rest, so `write` does it now and then only."""
         curve.draw({self.method: self.rows}, self.path / PICTURE, self.title)
         self._drawn = time.monotonic()
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents, without unpickling anything but plain data; raises `InputError` for what is none."""
-    try:
-        saved = torch.load(path, weights_only=True)
-        if saved.get("format") != FORMAT:
-            raise InputError(f"'{path}' has format {saved.get('format')!r}: must be {FORMAT!r}")
-    except FileNotFoundError:
-        raise InputError(f"no checkpoint at '{path}'") from None
-    except InputError:
-        raise
-    except Exception as error:  # pickle, zipfile and torch raise whatever they like on damaged files
-        raise InputError(f"'{path}' is not a readable checkpoint: {error}") from error
-    return dict(saved)
