@@ -41,6 +41,10 @@ def view(
     keyframe: Annotated[str | None, typer.Option(help="MJCF only: start from this named state of the file.")] = None,
     host: Annotated[str, typer.Option(help="Who may connect: 127.0.0.1 is this computer only, 0.0.0.0 everyone.")] = "127.0.0.1",
     port: Annotated[int, PORT.option("Where; the next free one is taken if it is not free.")] = 8080,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Of web pages elsewhere that may connect, such as https://hub.example.org; may be given several times."),
+    ] = None,
 ) -> None:
     """Shows a rollout, or simulates and shows a scene or a robot file. With --html, --png or --mp4: writes files instead."""
     from pbfd_torch.viewer import Inspector, Live, save_film, save_html, save_png
@@ -55,7 +59,7 @@ def view(
     if live:
         if recorded or ghost or html or png or film:
             raise InputError("--live is for a scene or a robot file, without --ghost, --html, --png and --mp4")
-        _serve(Live(load_setup(what, 1, choices), dt, integrator.value, host, port))
+        _serve(Live(load_setup(what, 1, choices), dt, integrator.value, host, port, origin or ()))
         return
     if recorded:
         given = {"--worlds": worlds, "--duration": duration, "--dt": dt, "--seed": seed, "--keyframe": keyframe}
@@ -84,7 +88,7 @@ def view(
             save_film(rollout, film, other, side_by_side, contacts, progress=progress)
         print(f"film written to {film}")
     if html is None and png is None and film is None:
-        _serve(Inspector(rollout, other, host, port))
+        _serve(Inspector(rollout, other, host, port, origin or ()))
 
 
 def _serve(shown: Inspector | Live) -> None:
