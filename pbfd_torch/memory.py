@@ -6,6 +6,9 @@ import os
 import re
 from pathlib import Path
 
+from pbfd_torch.errors import InputError
+
+LEAST_OF_A_WORLD = 2**14  # bytes that a world of one free body takes at least while it is stepped
 SHARE = 0.5  # of the memory that is available: what one request may take
 _MEMINFO = Path("/proc/meminfo")
 _GROUP = Path("/sys/fs/cgroup")  # of a container, which may have less than its machine
@@ -20,6 +23,20 @@ def available() -> int:
 def share() -> int:
     """Bytes that one request may take: half of what is available."""
     return int(SHARE * available())
+
+
+def most_worlds() -> int:
+    """How many of the smallest worlds have room in that."""
+    return max(1, share() // LEAST_OF_A_WORLD)
+
+
+def require_room(name: str, worlds: float) -> None:
+    """Raises `InputError` naming who asks for more worlds than that, fewer than one, or no whole number of them."""
+    if not isinstance(worlds, int) or not 1 <= worlds <= most_worlds():
+        raise InputError(
+            f"{name} is {worlds}: must be from 1 to {most_worlds()}, which have {LEAST_OF_A_WORLD // 1024} KiB each "
+            f"in half of the memory that is available, {gibibytes(share())}"
+        )
 
 
 def gibibytes(count: float) -> str:

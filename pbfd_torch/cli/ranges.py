@@ -40,21 +40,9 @@ class Range:
 class WorldsRange:
     """As many worlds as memory has room for, as far as that can be known before the scene is."""
 
-    @property
-    def most(self) -> int:
-        return max(1, memory.share() // LEAST_OF_A_WORLD)
-
-    def check(self, name: str, value: float) -> None:
-        """See `Range`."""
-        if not 1 <= value <= self.most:
-            raise InputError(
-                f"{name} is {value}: must be from 1 to {self.most}, which have {LEAST_OF_A_WORLD // 1024} KiB each "
-                f"in half of the memory that is available, {memory.gibibytes(memory.share())}"
-            )
-
     def option(self, help: str, *names: str) -> Any:  # noqa: A002  (typer's own name)
         """See `Range`."""
-        return typer.Option(*names, help=f"{help} Must be ≥ 1; memory says how many.", callback=_checked(self.check))
+        return typer.Option(*names, help=f"{help} Must be ≥ 1; memory says how many.", callback=_checked(memory.require_room))
 
 
 def _checked(check: Callable[[str, float], None]) -> Callable[..., Any]:
@@ -71,8 +59,6 @@ def _text(value: float) -> str:
     """Integers with all their digits."""
     return str(value) if isinstance(value, int) else f"{value:g}"
 
-
-LEAST_OF_A_WORLD = 2**14  # [bytes] that a world of one free body takes at least while it is stepped
 
 WORLDS = WorldsRange()
 STEP = Range(SHORTEST_STEP, unit="s")
