@@ -32,7 +32,7 @@ Place = tuple[Any, ...]
 
 def places(structure: Any, before: Place = ()) -> list[Place]:
     """The keys that lead to every entry of a structure, inner ones included."""
-    listed = enumerate(structure) if isinstance(structure, list | tuple) else ()
+    listed = enumerate(structure) if isinstance(structure, list) else ()
     items = structure.items() if isinstance(structure, dict) else listed
     return [place for key, value in items for place in ((*before, key), *places(value, (*before, key)))]
 
