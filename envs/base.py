@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,14 +14,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from pbfd_torch import memory
 from pbfd_torch.envs.packing import packed, unpacked
 from pbfd_torch.envs.randomization import DrawnWorlds, Randomization
+from pbfd_torch.envs.seeds import checked_seed, checked_seeds
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, State
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.per_world import chosen
+from pbfd_torch.stepping.stepper import SHORTEST_STEP
 from pbfd_torch.terms.actuators import Actuators
 
 DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
@@ -105,11 +108,13 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         max_episode_steps: int | None = None,
         randomization: Randomization | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise InputError(f"num_envs is {num_envs}: must be ≥ 1")
+        memory.require_room("num_envs", num_envs)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.control_dt = self.task_dt if control_dt is None else control_dt
         self.dt = self.control_dt if dt is None else dt
+        for name, step in (("control_dt", self.control_dt), ("dt", self.dt)):
+            if not (math.isfinite(step) and step >= SHORTEST_STEP):
+                raise InputError(f"{name} is {step} s: must be ≥ {SHORTEST_STEP:g} and finite")
         self.substeps = round(self.control_dt / self.dt)
         if self.substeps < 1 or abs(self.substeps * self.dt - self.control_dt) > 1e-9 * self.control_dt:
             raise InputError(f"dt is {self.dt} s: must divide the control step, {self.control_dt} s")
@@ -126,7 +131,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.low, self.high = bank.control_range.unbind(-1)
         if not bool(torch.isfinite(bank.control_range).all()):
             raise InputError("actuators of an environment need control ranges")
-        self._seed = 0 if seed is None else seed
+        self._seed = 0 if seed is None else checked_seed(seed)
         self._set_seed(self._seed)
         start = self._fresh(1)
         self._like: State = self._state_like
@@ -189,8 +194,25 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         return True
 
     def _set_seed(self, seed: int | None) -> None:
-        self._random = torch.Generator(self.device).manual_seed(0 if seed is None else seed)
+        self._random = self._generator(0 if seed is None else seed)
+        self._rows: list[torch.Generator] = []  # one for each world, once these have seeds of their own
         self._pool: dict[str, Tensor] = {}
+
+    def _generator(self, seed: int) -> torch.Generator:
+        return torch.Generator(self.device).manual_seed(seed)
+
+    def set_seeds(self, seeds: Sequence[int | None]) -> None:
+        """Gives every world random numbers of its own: what it draws from now on follows from its seed, whatever other worlds do.
+
+        seeds: one for each world, from 0 to 2⁶⁴ − 1; None goes on with what that world had. `set_seed` ends it. Raises
+        `InputError` for another number of them."""
+        worlds = math.prod(self.batch_size)
+        found = checked_seeds(list(seeds), worlds)
+        assert isinstance(found, list)
+        if not self._rows:
+            drawn = torch.randint(2**62, (worlds,), generator=self._random, device=self.device)
+            self._rows = [self._generator(seed) for seed in drawn.tolist()]
+        self._rows = [row if seed is None else self._generator(seed) for row, seed in zip(self._rows, found, strict=True)]
 
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -199,7 +221,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             return self._seen(unpacked(state, self._like), state)
         where = torch.ones(self.batch_size, dtype=torch.bool, device=self.device) if mask is None else mask.reshape(self.batch_size)
         index = where.nonzero().squeeze(-1)
-        fresh = self._taken(len(index))
+        fresh = self._begun(index.tolist()) if self._rows else self._taken(len(index))
         # rows that are not reset are not read: torchrl keeps those of the step
         whole = {name: value.new_zeros((*self.batch_size, *value.shape[1:])) for name, value in fresh.items()}
         state = {name: value.index_copy(0, index, fresh[name]) for name, value in whole.items()}
@@ -223,8 +245,13 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for name, source in (("state", "reset or set_state gives it"), ("action", "the policy gives it")):
+            if name not in tensordict.keys():  # noqa: SIM118  (a tensordict's `in` asks for something else)
+                raise InputError(f"a step from a tensordict without '{name}': {source}")
         flat = dict(tensordict["state"].items())
         action = tensordict["action"]
+        if not action.is_floating_point():
+            raise InputError(f"action is {action.dtype}: must be floating-point numbers")
         if action.shape != self.action_spec.shape:
             raise InputError(f"action has shape {tuple(action.shape)}: must be {tuple(self.action_spec.shape)}")
         with torch.no_grad():
@@ -233,7 +260,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         truncated = (steps >= self.max_episode_steps) & ~outcome.terminated[:, None]
         state = packed(outcome.state) | {"steps": steps} | {name: flat[name] for name in KEPT if name in flat}
         if self.randomization is not None:
-            state["world_push"] = self.randomization.pushed(flat["world_push"], self._random)
+            state["world_push"] = self._pushed(self.randomization, flat["world_push"])
         return TensorDict(
             {
                 "observation": outcome.observation.float(),
@@ -281,7 +308,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         for what, value, width in (("q", q, self.scene.articulation.nq), ("v", v, self.scene.articulation.nv)):
             if value.shape != (*self.batch_size, width):
                 raise InputError(f"{what} has shape {tuple(value.shape)}: must be {(*self.batch_size, width)}")
-        flat = self._started(q, v)
+        flat = self._started(q, v, self._drawn(len(q), self._random))
         return self._seen(unpacked(flat, self._like), flat)
 
     def _velocity(self, simulator: Simulator[Any], state: State) -> Tensor:
@@ -293,18 +320,31 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             return self.simulator
         return self._worlds.simulator(*(drawn[name] for name in DRAWN))
 
-    def _started(self, q: Tensor, v: Tensor) -> dict[str, Tensor]:
-        """Packed states at q with v, at the first step of an episode."""
-        worlds = len(q)
-        flat = {"steps": torch.zeros((worlds, 1), dtype=torch.int64, device=q.device), "start_v": v.clone()}
-        drawn = None if self.randomization is None else self.randomization.drawn(worlds, self._random)
+    def _started(self, q: Tensor, v: Tensor, drawn: dict[str, Tensor] | None) -> dict[str, Tensor]:
+        """Packed states at q with v, at the first step of an episode of worlds with what they have drawn."""
+        flat = {"steps": torch.zeros((len(q), 1), dtype=torch.int64, device=q.device), "start_v": v.clone()}
         with torch.no_grad():
             state = self._of(drawn).initial_state(q, v)
         self._state_like = state
         return packed(state) | flat | (drawn or {})
 
+    def _drawn(self, worlds: int, random: torch.Generator) -> dict[str, Tensor] | None:
+        return None if self.randomization is None else self.randomization.drawn(worlds, random)
+
+    def _pushed(self, randomization: Randomization, push: Tensor) -> Tensor:
+        if not self._rows:
+            return randomization.pushed(push, self._random)
+        return torch.cat([randomization.pushed(one, random) for one, random in zip(push.split(1), self._rows, strict=True)])
+
     def _fresh(self, worlds: int) -> dict[str, Tensor]:
-        return self._started(*self.start(worlds, self._random))
+        return self._started(*self.start(worlds, self._random), self._drawn(worlds, self._random))
+
+    def _begun(self, rows: Sequence[int]) -> dict[str, Tensor]:
+        """Starts of these worlds, each from its own random numbers."""
+        starts = [(self.start(1, self._rows[k]), self._drawn(1, self._rows[k])) for k in rows]
+        q, v = (torch.cat(x) for x in zip(*(start for start, _ in starts), strict=True))
+        each = [drawn for _, drawn in starts if drawn is not None]
+        return self._started(q, v, {name: torch.cat([x[name] for x in each]) for name in DRAWN} if each else None)
 
     def _taken(self, worlds: int) -> dict[str, Tensor]:
         """As many starts, out of a pool that is filled when it is empty: a solve for many costs little more than one for a few."""

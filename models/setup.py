@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,6 +12,11 @@ from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 
 Metric = float | list[float]
+
+
+def nothing(setup: Setup, rollout: Rollout) -> Mapping[str, Metric]:
+    """The report of a scene without numbers of its own; not a lambda, so that setups can be pickled."""
+    return {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +36,7 @@ class Setup:
     v: Tensor
     duration: float
     dt: float
-    report: Callable[[Setup, Rollout], Mapping[str, Metric]] = field(default=lambda setup, rollout: {})
+    report: Callable[[Setup, Rollout], Mapping[str, Metric]] = nothing
     notes: Sequence[str] = ()
     control: Tensor | None = None
 

@@ -321,7 +321,7 @@ def test_duration_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 def test_bad_duration(duration: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """It is named, with what is valid."""
     assert call(monkeypatch, "--duration", duration) == 2
-    assert capsys.readouterr().err == f"pbfd: --duration is {duration} s: must be within [0.1, 60]\n"
+    assert capsys.readouterr().err == f"pbfd: --duration is {duration} s: must be from 0.1 to 60\n"
 
 
 def test_out_must_be_a_folder(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

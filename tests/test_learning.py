@@ -19,8 +19,9 @@ import torch
 from pbfd_torch import InputError, Rollout
 from pbfd_torch.envs import Randomization, make_env
 from pbfd_torch.learning import curve
+from pbfd_torch.learning.checkpoint import load_checkpoint
 from pbfd_torch.learning.evaluation import Policy, draw, tried
-from pbfd_torch.learning.folder import Folder, load_checkpoint
+from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.ppo import Ppo, PpoTrainer
 from pbfd_torch.learning.shac import Shac, ShacTrainer
 from pbfd_torch.learning.training_env import EnvSettings, location_and_scale, plain, seen_more, statistics, training_env
@@ -269,7 +270,7 @@ def test_the_best_checkpoint_is_the_one_that_was_measured(tmp_path: Path) -> Non
     folder = Folder(tmp_path, "PPO", "pole", resume=False)
     for frames, episodes, mean in ((1, 0, math.nan), (2, 64, 5.0), (3, 0, math.nan), (4, 64, 4.0), (5, 64, 6.0), (6, 0, math.nan)):
         folder.rows.append(curve.Row(frames, 1.0, episodes, mean, mean, mean, 1.0, 0.0, 0.0, 0.0))
-        folder.write({}, {})
+        folder.write({"env": dataclasses.asdict(POLE), "width": 64}, {})
         assert (tmp_path / "best.pt").exists() == (frames > 1)
         if frames > 1:
             assert load_checkpoint(tmp_path / "best.pt")["rows"][-1]["frames"] == (2 if frames < 5 else 5)
@@ -293,6 +294,11 @@ def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: Ppo(POLE, width=10**9), "width is 1000000000: must be an integer from 1 to 4096"),
+        (lambda: EnvSettings("hopper", num_envs=0), "num_envs is 0"),
+        (lambda: EnvSettings("hopper", seed=-1), "seed is -1"),
+        (lambda: EnvSettings("hopper", control_dt=math.inf), r"control_dt \[s\] is inf"),
+        (lambda: EnvSettings("hopper", max_episode_steps=0), "max_episode_steps is 0"),
         (lambda: Ppo(POLE, horizon=0), "horizon is 0"),
         (lambda: Ppo(POLE, workers=2, ray=2), "give one of the two"),
         (lambda: Ppo(POLE, gamma=1.0), "gamma is 1.0"),

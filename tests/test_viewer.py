@@ -327,6 +327,6 @@ def test_hostile_files_are_refused(rollout: Rollout, tmp_path: Path, monkeypatch
     with pytest.raises(InputError, match="single array"):
         Rollout.load(tmp_path / "single.npy")
     rollout.save(path)
-    monkeypatch.setattr("pbfd_torch.records.rollout.LARGEST", 1000)
+    monkeypatch.setattr("pbfd_torch.memory.available", lambda: 2000)
     with pytest.raises(InputError, match="claims"):
         Rollout.load(path)

@@ -26,6 +26,7 @@ from torch import Tensor
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider
+from pbfd_torch.files import write_figure
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -201,7 +202,7 @@ def draw(curves: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     ]
     figure.legend(handles=[*steps, *marks], loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(f"Fig. 5: a box that starts at {SPEED:g} m/s; sliding distance against the strength of friction", fontsize=13)
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)
 
 

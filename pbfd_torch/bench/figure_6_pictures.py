@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pbfd_torch.bench.figure_6 import SCENE, STARTS, TITLES, Row
+from pbfd_torch.files import write_figure
 from pbfd_torch.models import chains
 
 STYLES: Mapping[str, dict[str, Any]] = {
@@ -62,7 +63,7 @@ def draw(report: Mapping[str, Any], path: Path) -> None:
     named.append(Line2D([], [], color="0.3", marker="x", linestyle="", label="unstable or NaN"))
     figure.legend(handles=named, loc="outside lower center", ncols=8, frameon=False)
     figure.suptitle(f"Fig. 6: a chain of ten links slides off a slope, {report['duration_s']:g} s", fontsize=13)
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)
 
 

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from pbfd_torch.bench.table_1 import SUBSTEPS
+from pbfd_torch.files import write_figure
 
 # one colour per optimiser, dark on GE and light on E; the default in black
 STYLES: dict[str, dict[str, Any]] = {
@@ -123,5 +124,5 @@ def _guides(axes: Axes, sizes: Sequence[int]) -> None:
 
 
 def _save(figure: Any, path: Path) -> None:
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 
 from pbfd_torch.bench.precision import ADAPTIVE, PEER
 from pbfd_torch.bench.precision_levels import Row, batch_of
+from pbfd_torch.files import write_figure
 
 FLOOR = 1e-12  # smaller errors are drawn here
 COLORS = ("#000000", "#e8a400", "#2ca02c", "#d62728", "#8c564b", "#17becf")  # ours
@@ -118,5 +119,5 @@ def _figure(
     handles.append(Line2D([], [], color="0.6", linestyle=":", label="± of a reference of its own"))
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(title, fontsize=13)
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)

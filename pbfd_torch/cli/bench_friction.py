@@ -13,8 +13,9 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.outputs import check_folder
 
 FILES = ("friction.json", "fig5.png")
 VALUES, QUICK_VALUES = 21, 9

@@ -13,9 +13,11 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, chosen, environment, new_table, plain, write_files
+from pbfd_torch.cli.benchmarks import chosen, environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.outputs import check_folder
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_whole
 from pbfd_torch.integrators.named import INTEGRATORS
 
 if TYPE_CHECKING:
@@ -94,7 +96,7 @@ def write(results: Sequence[Result], report: dict[str, Any], folder: Path) -> No
         folder,
         report,
         FILES[0],
-        lambda: (folder / FILES[1]).write_text(markdown(report, results)),
+        lambda: write_whole(folder / FILES[1], markdown(report, results)),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -14,21 +13,22 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
-from pbfd_torch.errors import InputError
+from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.cli.ranges import TRAJECTORY
+from pbfd_torch.files import write_whole
 
 if TYPE_CHECKING:
     from pbfd_torch.bench.figure_6 import Effort
 
 FILES = ("slope.json", "slope.md", "figure-6.png")
-DURATIONS = (0.1, 60.0)  # [s] that can be asked for
 
 
 def slope(
     out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-slope"),
     duration: Annotated[
-        float | None, typer.Option(help="Simulated time of a trajectory in seconds; default: 10, or 1 with --quick.")
+        float | None, TRAJECTORY.option("Simulated time of a trajectory in seconds; default: 10, or 1 with --quick.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Three time steps, a small batch, a short trajectory.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
@@ -38,9 +38,6 @@ def slope(
     unsolved."""
     from pbfd_torch.bench.figure_6 import FULL, OURS, QUICK
 
-    low, high = DURATIONS
-    if duration is not None and not (math.isfinite(duration) and low <= duration <= high):
-        raise InputError(f"--duration is {duration:g} s: must be within [{low:g}, {high:g}]")
     check_folder(out, FILES)
     use_threads(1)
     effort = QUICK if quick else FULL
@@ -85,7 +82,7 @@ def write(report: dict[str, Any], folder: Path) -> None:
         folder,
         report,
         FILES[0],
-        lambda: (folder / FILES[1]).write_text(markdown(report)),
+        lambda: write_whole(folder / FILES[1], markdown(report)),
         lambda: draw(report, folder / FILES[2]),
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -15,41 +14,33 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
 from pbfd_torch.cli.options import Choices, load_setup, use_threads
+from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.cli.ranges import MEASURED_SECONDS, MEASURED_STEP, MEASURED_STEPS, MEASURED_WORLDS, REPEATS
 from pbfd_torch.errors import InputError
-from pbfd_torch.stepping.stepper import SHORTEST_STEP
 
-LONGEST_STEP = 0.1  # [s]: the paper's largest
-MOST_STEPS, MOST_WORLDS, MOST_REPEATS, MOST_DOFS = 10_000, 4096, 1000, 200
+MOST_DOFS = 200
 FILES = ("solvers.json", "fig4.png", "table1.png")
 
 
 def solvers(
     out: Annotated[Path, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = Path("bench-solvers"),
-    steps: Annotated[int, typer.Option(help="Fig. 4: steps of each chain.")] = 60,
-    dt: Annotated[float | None, typer.Option(help="Fig. 4: time step in seconds; default: each scene's.")] = None,
-    worlds: Annotated[int, typer.Option(help="Fig. 4: worlds in the batch, all but the first with small extra velocities.")] = 1,
+    steps: Annotated[int, MEASURED_STEPS.option("Fig. 4: steps of each chain.")] = 60,
+    dt: Annotated[float | None, MEASURED_STEP.option("Fig. 4: time step in seconds; default: each scene's.")] = None,
+    worlds: Annotated[int, MEASURED_WORLDS.option("Fig. 4: worlds, all but the first with small extra velocities.")] = 1,
     seconds: Annotated[
-        float, typer.Option(help="Fig. 4: time for each case on each chain; slow ones get through fewer steps.")
+        float, MEASURED_SECONDS.option("Fig. 4: time for each case on each chain; slow ones get through fewer steps.")
     ] = 12.0,
     sizes: Annotated[str, typer.Option(help="Table I: degrees of freedom, separated by commas.")] = "5,10,20,40,80",
-    batch: Annotated[int, typer.Option(help="Table I: worlds in the batch, beside a single one.")] = 256,
-    repeats: Annotated[int, typer.Option(help="Times that a short measurement is repeated; the shortest counts.")] = 5,
+    batch: Annotated[int, MEASURED_WORLDS.option("Table I: worlds in the batch, beside a single one.")] = 256,
+    repeats: Annotated[int, REPEATS.option("Times that a short measurement is repeated; the shortest counts.")] = 5,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
 ) -> None:
     """Compares LM, JTJ-LM and L-BFGS on E and GE with the default: Fig. 4 (iterations, time and error of every step of two chains)
     and Table I (cost of each substep over the degrees of freedom). One thread, float64. Exit status 1: the default left a step
     unsolved."""
     counts = parsed_sizes(sizes)
-    check_count("--steps", steps, MOST_STEPS)
-    check_count("--worlds", worlds, MOST_WORLDS)
-    check_count("--batch", batch, MOST_WORLDS)
-    check_count("--repeats", repeats, MOST_REPEATS)
-    if dt is not None and not SHORTEST_STEP <= dt <= LONGEST_STEP:
-        raise InputError(f"--dt is {dt} s: must be from {SHORTEST_STEP:g} to {LONGEST_STEP:g}")
-    if not (math.isfinite(seconds) and seconds > 0):
-        raise InputError(f"--seconds is {seconds}: must be > 0 and finite")
     check_folder(out, FILES)
     use_threads(1)
     report = measured(steps, dt, worlds, seconds, counts, batch, repeats)
@@ -59,12 +50,6 @@ def solvers(
     else:
         print_report(report, out)
     raise typer.Exit(min(1, sum(chain["cases"]["default"]["unsolved_steps"] for chain in report["figure_4"]["chains"].values())))
-
-
-def check_count(option: str, value: int, most: int) -> None:
-    """Raises `InputError` unless 1 ≤ value ≤ most."""
-    if not 1 <= value <= most:
-        raise InputError(f"{option} is {value}: must be from 1 to {most}")
 
 
 def parsed_sizes(text: str) -> list[int]:

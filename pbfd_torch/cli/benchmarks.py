@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-import os
 import platform
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,7 @@ import torch
 from rich.table import Table
 
 from pbfd_torch.errors import InputError
-
-
-def check_folder(folder: Path, files: Sequence[str]) -> None:
-    """Raises `InputError` now rather than after the measurement."""
-    existing = folder
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
-    if not existing.is_dir() or not os.access(existing, os.W_OK) or any((folder / name).is_dir() for name in files):
-        raise InputError(f"--out is '{folder}': must be a folder, new or not, that can be written to")
+from pbfd_torch.files import write_whole
 
 
 def chosen(option: str, text: str, valid: Iterable[str], read: Callable[[str], str] = str.strip, what: str = "") -> list[str]:
@@ -39,8 +30,7 @@ def chosen(option: str, text: str, valid: Iterable[str], read: Callable[[str], s
 def write_files(folder: Path, report: dict[str, Any], name: str, *others: Callable[[], object]) -> None:
     """The report as JSON under that name, and whatever else the `others` write. Raises `InputError` where that cannot be done."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        write_whole(folder / name, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
         for write in others:
             write()
     except OSError as error:

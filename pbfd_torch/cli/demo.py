@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from pbfd_torch.cli.options import Choices, load_setup, use_threads
+from pbfd_torch.cli.outputs import check_file
 from pbfd_torch.cli.picture import draw
-from pbfd_torch.cli.simulate import check_writable, print_summary, simulated
+from pbfd_torch.cli.simulate import print_summary, simulated
 
 
 def run(folder: Path) -> int:
     """Writes `rollout.npz` and `picture.png` into `folder`; the exit status as of `pbfd simulate`."""
     target = folder / "rollout.npz"
-    check_writable(target)
+    check_file("--out", target, ".npz")
     use_threads(1)
     choices = Choices()
     result = simulated(load_setup("chain-slope-drop", 64, choices), choices, dt=0.05)

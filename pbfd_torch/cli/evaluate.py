@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import json
 import sys
 from pathlib import Path
@@ -13,24 +14,33 @@ from rich.table import Table
 from tqdm import tqdm
 
 from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.cli.ranges import SEED, WORLDS
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_whole
 
-SIMULATORS = ("pbfd", "newton-euler", "mujoco")
+FILES = ("returns.png", "returns.json")
+
+
+class On(enum.StrEnum):
+    PBFD = "pbfd"
+    NEWTON_EULER = "newton-euler"
+    MUJOCO = "mujoco"
 
 
 def evaluate(
     checkpoints: Annotated[list[Path], typer.Argument(help="Checkpoints or folders of `pbfd train`.", show_default=False)],
-    on: Annotated[list[str] | None, typer.Option(help="pbfd, newton-euler or mujoco; give it several times; default: all.")] = None,
-    episodes: Annotated[int, typer.Option(help="Of each policy in each simulator.")] = 64,
-    seed: Annotated[int, typer.Option(help="Of the starts.")] = 1000,
+    on: Annotated[list[On] | None, typer.Option(help="Give it several times; default: all.")] = None,
+    episodes: Annotated[int, WORLDS.option("Of each policy in each simulator.")] = 64,
+    seed: Annotated[int, SEED.option("Of the starts.")] = 1000,
     out: Annotated[Path | None, typer.Option(help="Folder for the picture, the numbers and a rollout of each.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Mean return and spread of policies, where they were trained and elsewhere."""
     from pbfd_torch.learning.evaluation import Policy, Trial, draw, tried
 
-    if episodes < 1:
-        raise InputError(f"--episodes is {episodes}: must be ≥ 1")
+    if out is not None:
+        check_folder(out, FILES)
     use_threads(1)
     found: dict[str, list[Trial]] = {}
     numbers: list[dict[str, Any]] = []
@@ -40,7 +50,7 @@ def evaluate(
         if name in found:
             raise InputError(f"two checkpoints are called '{name}': their folders must have different names")
         found[name] = []
-        for kind in on or SIMULATORS:
+        for kind in dict.fromkeys(x.value for x in on or On):
             with tqdm(total=1000, unit="step", desc=f"{name} on {kind}", disable=not sys.stderr.isatty(), leave=False) as bar:
                 trial = tried(policy, policy.settings, kind, episodes, seed, lambda k, alive: bar.update(k - bar.n))
             found[name].append(trial)
@@ -61,8 +71,8 @@ def evaluate(
             if out is not None:
                 trial.rollout.save(out / f"{name}-{kind}.npz")
     if out is not None:
-        draw(found, out / "returns.png")
-        (out / "returns.json").write_text(json.dumps(numbers, indent=1))
+        draw(found, out / FILES[0])
+        write_whole(out / FILES[1], json.dumps(numbers, indent=1))
     if as_json:
         print(json.dumps({"trials": numbers}))
         return

@@ -17,6 +17,7 @@ from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.evaluate import evaluate
 from pbfd_torch.cli.optimize import optimize
 from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
+from pbfd_torch.cli.ranges import ACCURACY, DURATION, PROCESSES, SEED, STEP, THREADS, WORLDS
 from pbfd_torch.cli.train import train
 from pbfd_torch.cli.view import view
 from pbfd_torch.errors import NotModelledWarning, PbfdError
@@ -46,12 +47,12 @@ _SCENE = typer.Argument(help="A named scene, or a URDF or MJCF file. `pbfd scene
 @app.command()
 def simulate(
     scene: Annotated[str, _SCENE],
-    worlds: Annotated[int | None, typer.Option(help="Independent worlds in the batch; default: what the scene has.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Simulated time in seconds; default: the scene's.")] = None,
-    dt: Annotated[float | None, typer.Option(help="Time step in seconds; default: the scene's.")] = None,
+    worlds: Annotated[int | None, WORLDS.option("Independent worlds in the batch; default: what the scene has.")] = None,
+    duration: Annotated[float | None, DURATION.option("Simulated time in seconds; default: the scene's.")] = None,
+    dt: Annotated[float | None, STEP.option("Time step in seconds; default: the scene's.")] = None,
     accuracy: Annotated[
         float | None,
-        typer.Option(help="Let every world choose its steps, each of which may be off by so much [m]; --dt: the longest one."),
+        ACCURACY.option("Let every world choose its steps, each of which may be off by so many metres; --dt: the longest one."),
     ] = None,
     integrator: Annotated[Integrator, typer.Option(help="Time integrator.")] = Integrator.ENERGY_MOMENTUM,
     solver: Annotated[
@@ -63,11 +64,11 @@ def simulate(
     schedule: Annotated[
         Schedule, typer.Option(help="Asynchronous: a world that is done with a step does not wait for the others.")
     ] = Schedule.LOCK_STEP,
-    workers: Annotated[int, typer.Option(help="Processes that share the worlds, one CPU core each.")] = 1,
+    workers: Annotated[int, PROCESSES.option("Processes that share the worlds, one CPU core each.")] = 1,
     threads: Annotated[
-        int, typer.Option(help="PyTorch's threads inside an operation; more than one pays for very large batches only.")
+        int, THREADS.option("PyTorch's threads inside an operation; more than one pays for very large batches only.")
     ] = 1,
-    seed: Annotated[int | None, typer.Option(help="Give all worlds but the first small random extra velocities.")] = None,
+    seed: Annotated[int | None, SEED.option("Give all worlds but the first small random extra velocities.")] = None,
     fixed_base: Annotated[
         bool | None,
         typer.Option("--fixed-base/--free-base", help="URDF only: is the root welded to the world?", show_default=False),
@@ -124,13 +125,13 @@ def _one_line(message: Warning | str, category: type[Warning], filename: str, li
 
 
 def main() -> None:
-    """Entry point. Bad input ends with status 2 and one line that names it."""
+    """Entry point. Bad input, and what the system refuses, ends with status 2 and one line that names it."""
     warnings.simplefilter("ignore", NotModelledWarning)  # the commands list these lines themselves
     warnings.formatwarning = _one_line
     try:
         app()
-    except PbfdError as error:
-        print(f"pbfd: {error}", file=sys.stderr)
+    except (PbfdError, OSError, MemoryError) as error:
+        print(f"pbfd: {' '.join(str(error).split()) or 'out of memory'}", file=sys.stderr)
         sys.exit(2)
 
 

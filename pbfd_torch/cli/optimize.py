@@ -13,9 +13,12 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, plain
+from pbfd_torch.cli.benchmarks import plain
 from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.cli.ranges import ITERATIONS, SEED, THREADS, WORLDS
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_figure
 
 if TYPE_CHECKING:
     from pbfd_torch.optimize.tasks import Outcome, Task
@@ -25,10 +28,10 @@ FILES = ("before.npz", "after.npz", "cost.png")
 
 def optimize(
     task: Annotated[str, typer.Argument(help="box-throw, arm-swing-up or hopper.", show_default=False)],
-    iterations: Annotated[int | None, typer.Option(help="At most so many; default: what the task needs.")] = None,
-    worlds: Annotated[int, typer.Option(help="Random starts, optimised as one batch.")] = 8,
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    threads: Annotated[int, typer.Option(help="PyTorch's threads inside an operation.")] = 1,
+    iterations: Annotated[int | None, ITERATIONS.option("At most so many; default: what the task needs.")] = None,
+    worlds: Annotated[int, WORLDS.option("Random starts, optimised as one batch.")] = 8,
+    seed: Annotated[int, SEED.option("Of the random starts.")] = 0,
+    threads: Annotated[int, THREADS.option("PyTorch's threads inside an operation.")] = 1,
     out: Annotated[Path | None, typer.Option(help=f"Folder for {', '.join(FILES)}.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
@@ -110,5 +113,5 @@ def draw(name: str, outcome: Outcome[Any], path: Path) -> None:
     axes.set_ylabel("cost")
     axes.set_title(f"{name}: {int(outcome.reached.sum())} of {len(outcome.reached)} reached the goal (red: not)")
     axes.grid(alpha=0.3)
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)

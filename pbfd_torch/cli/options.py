@@ -101,8 +101,6 @@ class Choices:
     def __post_init__(self) -> None:
         if self.accuracy is not None and self.schedule is Schedule.ASYNCHRONOUS:
             raise InputError("--accuracy lets every world go at its own pace already: leave out --schedule asynchronous")
-        if self.workers < 1:
-            raise InputError(f"--workers is {self.workers}: must be ≥ 1")
         if self.schedule is Schedule.ASYNCHRONOUS and self.workers > 1:
             raise InputError(f"--workers is {self.workers}: must be 1 with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
@@ -122,17 +120,11 @@ class Choices:
 def use_threads(count: int) -> None:
     """Lets PyTorch use `count` CPU threads. Its default, one per core, makes the factorisation of many small matrices up to 20
     times slower where another process uses a core."""
-    if count < 1:
-        raise InputError(f"--threads is {count}: must be ≥ 1")
     torch.set_num_threads(count)
 
 
 def load_setup(scene: str, worlds: int | None, choices: Choices) -> Setup:
     """The named scene or the file, in the wanted number of worlds, on the wanted device. Raises `InputError` or `ModelError`."""
-    if worlds is not None and worlds < 1:
-        raise InputError(f"--worlds is {worlds}: must be ≥ 1")
-    if choices.seed is not None and not -(2**63) <= choices.seed < 2**64:
-        raise InputError(f"--seed is {choices.seed}: must be from -2⁶³ to 2⁶⁴ - 1")
     if choices.device is Device.CUDA and not torch.cuda.is_available():
         raise InputError("--device is cuda, but PyTorch finds no CUDA device: choose cpu")
     if scene in SCENES:

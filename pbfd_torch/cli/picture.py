@@ -16,6 +16,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.files import write_figure
 from pbfd_torch.models import Setup
 from pbfd_torch.records.rollout import Rollout
 
@@ -37,8 +38,7 @@ def draw(setup: Setup, rollout: Rollout, path: Path, strobe_s: float = 0.9) -> N
         f"{rollout.scene_name}: {setup.worlds} worlds, Δt = {rollout.dt:g} s, {rollout.steps} steps, {unsolved} unsolved",
         fontsize=14,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    write_figure(path, figure)
     plt.close(figure)
 
 

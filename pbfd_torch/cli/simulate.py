@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -16,10 +15,13 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from pbfd_torch import memory
 from pbfd_torch.cli.options import Choices, Schedule, with_friction
+from pbfd_torch.cli.outputs import check_file
 from pbfd_torch.contact.hazards import Hazard
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import Setup
+from pbfd_torch.records.recording import least_bytes
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.schedules.workers import Workers
@@ -86,7 +88,7 @@ class Result:
 def run(setup: Setup, choices: Choices, duration: float | None, dt: float | None, out: Path | None, as_json: bool) -> int:
     """Runs and reports; the exit status: 0, or 1 where some world has an unsolved step."""
     if out is not None:
-        check_writable(out)
+        check_file("--out", out, ".npz")
     result = simulated(setup, choices, duration, dt)
     if out is not None:
         result.rollout.save(out)
@@ -102,13 +104,17 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     duration = setup.duration if duration is None else duration
     if dt is None:
         dt = setup.dt if choices.accuracy is None else min(FRAME, duration)
-    if not (math.isfinite(duration) and duration > 0):
-        raise InputError(f"--duration is {duration} s: must be > 0 and finite")
-    if not (math.isfinite(dt) and 0 < dt <= duration):
-        raise InputError(f"--dt is {dt} s: must be > 0 and at most the duration, {duration} s")
+    if dt > duration:
+        raise InputError(f"--dt is {dt:g} s: must be at most the duration, {duration:g} s")
     steps = round(duration / dt)
     if steps > MAX_STEPS:
-        raise InputError(f"--duration {duration} s at --dt {dt} s makes {steps} steps: must be at most {MAX_STEPS}")
+        raise InputError(f"--duration {duration:g} s at --dt {dt:g} s makes {steps} steps: must be at most {MAX_STEPS}")
+    size, most = least_bytes(setup.scene, setup.worlds, steps), memory.share()
+    if size > most:
+        raise InputError(
+            f"{steps} steps of {setup.worlds} worlds make a record of at least {memory.gibibytes(size)}: must be at most "
+            f"{memory.gibibytes(most)}, half of the memory that is available; choose fewer --worlds or a shorter --duration"
+        )
     setup = with_friction(setup, choices.friction, dt)
     simulator = choices.make_simulator(setup.scene, dt)
     controls = setup.controls(steps)
@@ -129,17 +135,6 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     if rollout.steps < steps:
         print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)
     return Result(setup, rollout, choices, wall)
-
-
-def check_writable(path: Path) -> None:
-    """Raises `InputError` now rather than after the simulation."""
-    if path.suffix != ".npz":
-        raise InputError(f"--out is '{path}': must end in .npz")
-    folder = path.parent
-    while not folder.exists():
-        folder = folder.parent
-    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"--out is '{path}': cannot be written there")
 
 
 def print_summary(result: Result, out: Path | None) -> None:

@@ -10,6 +10,8 @@ import typer
 from tqdm import tqdm
 
 from pbfd_torch.cli.options import Choices, Integrator, load_setup, use_threads
+from pbfd_torch.cli.outputs import check_file
+from pbfd_torch.cli.ranges import DURATION, FRAME, PORT, SEED, SIDE_BY_SIDE, STEP, WORLDS
 from pbfd_torch.errors import InputError
 from pbfd_torch.records.rollout import Rollout
 
@@ -24,25 +26,32 @@ def view(
     html: Annotated[Path | None, typer.Option(help="Write one page that plays by itself, without network.")] = None,
     png: Annotated[Path | None, typer.Option(help="Write a still.")] = None,
     film: Annotated[Path | None, typer.Option("--mp4", help="Write a film: .mp4 or .gif.")] = None,
-    frame: Annotated[int | None, typer.Option(help="Step of the still; default: in the middle.")] = None,
-    side_by_side: Annotated[int, typer.Option("--side-by-side", help="Worlds beside each other in files; at most 64.")] = 1,
+    frame: Annotated[int | None, FRAME.option("Step of the still; default: in the middle.")] = None,
+    side_by_side: Annotated[int, SIDE_BY_SIDE.option("Worlds beside each other in files.", "--side-by-side")] = 1,
     contacts: Annotated[bool, typer.Option("--contacts", help="Files show contact points and forces.")] = False,
-    worlds: Annotated[int | None, typer.Option(help="Of a scene: independent worlds.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Of a scene: simulated time in seconds.")] = None,
-    dt: Annotated[float | None, typer.Option(help="Of a scene: time step in seconds.")] = None,
+    worlds: Annotated[int | None, WORLDS.option("Of a scene: independent worlds.")] = None,
+    duration: Annotated[float | None, DURATION.option("Of a scene: simulated time in seconds.")] = None,
+    dt: Annotated[float | None, STEP.option("Of a scene: time step in seconds.")] = None,
     integrator: Annotated[Integrator, typer.Option(help="Of a scene: time integrator.")] = Integrator.ENERGY_MOMENTUM,
-    seed: Annotated[int | None, typer.Option(help="Of a scene: give all worlds but the first small random velocities.")] = None,
+    seed: Annotated[int | None, SEED.option("Of a scene: give all worlds but the first small random velocities.")] = None,
     fixed_base: Annotated[
         bool | None,
         typer.Option("--fixed-base/--free-base", help="URDF only: is the root welded to the world?", show_default=False),
     ] = None,
     keyframe: Annotated[str | None, typer.Option(help="MJCF only: start from this named state of the file.")] = None,
     host: Annotated[str, typer.Option(help="Who may connect: 127.0.0.1 is this computer only, 0.0.0.0 everyone.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Where; the next free one is taken if it is not free.")] = 8080,
+    port: Annotated[int, PORT.option("Where; the next free one is taken if it is not free.")] = 8080,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Of web pages elsewhere that may connect, such as https://hub.example.org; may be given several times."),
+    ] = None,
 ) -> None:
     """Shows a rollout, or simulates and shows a scene or a robot file. With --html, --png or --mp4: writes files instead."""
     from pbfd_torch.viewer import Inspector, Live, save_film, save_html, save_png
 
+    for option, path, endings in (("--html", html, (".html",)), ("--png", png, (".png",)), ("--mp4", film, (".mp4", ".gif"))):
+        if path is not None:
+            check_file(option, path, *endings)
     use_threads(1)
     recorded = Path(what).suffix == ".npz"
     free_base = None if fixed_base is None else not fixed_base
@@ -50,7 +59,7 @@ def view(
     if live:
         if recorded or ghost or html or png or film:
             raise InputError("--live is for a scene or a robot file, without --ghost, --html, --png and --mp4")
-        _serve(Live(load_setup(what, 1, choices), dt, integrator.value, host, port))
+        _serve(Live(load_setup(what, 1, choices), dt, integrator.value, host, port, origin or ()))
         return
     if recorded:
         given = {"--worlds": worlds, "--duration": duration, "--dt": dt, "--seed": seed, "--keyframe": keyframe}
@@ -79,7 +88,7 @@ def view(
             save_film(rollout, film, other, side_by_side, contacts, progress=progress)
         print(f"film written to {film}")
     if html is None and png is None and film is None:
-        _serve(Inspector(rollout, other, host, port))
+        _serve(Inspector(rollout, other, host, port, origin or ()))
 
 
 def _serve(shown: Inspector | Live) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
-import os
+import reprlib
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
+
+from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_figure, write_whole
+from pbfd_torch.learning.numbers import require_integer
+
+_COUNTS = ("frames", "episodes")
 
 
 @dataclass(frozen=True)
@@ -57,14 +64,13 @@ def of_episodes(returns: Tensor, lengths: Tensor) -> dict[str, Any]:
 
 def save(rows: Sequence[Row], path: Path) -> None:
     """The whole curve, or the old file stays."""
-    part = path.with_suffix(".part")
-    with part.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(Row.__dataclass_fields__))
-        writer.writeheader()
-        writer.writerows(
-            {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in asdict(r).items()} for r in rows
-        )
-    os.replace(part, path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(Row.__dataclass_fields__))
+    writer.writeheader()
+    writer.writerows(
+        {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in asdict(r).items()} for r in rows
+    )
+    write_whole(path, text.getvalue())
 
 
 def load(path: Path) -> list[Row]:
@@ -73,8 +79,23 @@ def load(path: Path) -> list[Row]:
         return [_row(row) for row in csv.DictReader(file)]
 
 
+def rows_of(saved: object) -> list[Row]:
+    """The rows that `asdict` has made plain. Raises `InputError` naming the row and the entry that are none."""
+    if not isinstance(saved, list):
+        raise InputError(f"rows is {reprlib.repr(saved)}: must be a list")
+    for k, row in enumerate(saved):
+        if not isinstance(row, dict) or set(row) != set(Row.__dataclass_fields__):
+            raise InputError(f"rows[{k}] is {reprlib.repr(row)}: must have the entries {', '.join(Row.__dataclass_fields__)}")
+        for name, value in row.items():
+            if name in _COUNTS:
+                require_integer(f"rows[{k}].{name}", value, 0, 2**63 - 1)
+            elif not isinstance(value, float):  # NaN where there is nothing to average
+                raise InputError(f"rows[{k}].{name} is {reprlib.repr(value)}: must be a number")
+    return [Row(**row) for row in saved]
+
+
 def _row(row: Mapping[str, str]) -> Row:
-    numbers: dict[str, Any] = {k: int(v) if k in ("frames", "episodes") else float(v) for k, v in row.items()}
+    numbers: dict[str, Any] = {k: int(v) if k in _COUNTS else float(v) for k, v in row.items()}
     return Row(**numbers)
 
 
@@ -114,4 +135,4 @@ def draw(curves: Mapping[str, Sequence[Row]], path: Path, title: str) -> None:
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="upper left")
-    figure.savefig(path)
+    write_figure(path, figure)

@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from pbfd_torch.envs import PbfdEnv, Step
-from pbfd_torch.learning.folder import load_checkpoint
+from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_figure
+from pbfd_torch.learning.checkpoint import checked_statistics, load_checkpoint, load_weights
 from pbfd_torch.learning.networks import make_actor, mean_action
 from pbfd_torch.learning.track import tracked
 from pbfd_torch.learning.training_env import EnvSettings, location_and_scale
@@ -33,13 +35,18 @@ class Policy:
 
     @staticmethod
     def load(path: Path) -> Policy:
-        """From a checkpoint of `pbfd train`; raises `InputError` for what is none."""
+        """From a checkpoint of `pbfd train`; raises `InputError` for what is none, naming what is wrong in it."""
         saved = load_checkpoint(path)
         settings = EnvSettings.of(saved["settings"]["env"])
-        probe = settings.make(num_envs=1)
-        actor = make_actor(probe.observation_spec["observation"].shape[-1], probe.action_spec, saved["settings"]["width"])
-        actor.load_state_dict(saved["actor"])
-        return Policy(settings, actor, *location_and_scale(saved["statistics"]))
+        try:
+            probe = settings.make(num_envs=1)
+            width = probe.observation_spec["observation"].shape[-1]
+            actor = make_actor(width, probe.action_spec, saved["settings"]["width"])
+            load_weights("actor", actor, saved.get("actor"))
+            statistics = checked_statistics(saved.get("statistics"), width)
+        except InputError as error:
+            raise InputError(f"'{path}' is not a usable checkpoint: {error}") from error
+        return Policy(settings, actor, *location_and_scale(statistics))
 
     def __call__(self, observation: Tensor) -> Tensor:
         """`[worlds, nobs] → [worlds, nu]`."""
@@ -131,4 +138,4 @@ def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:
     axis.set(ylabel="return, mean and standard deviation over episodes")
     axis.grid(axis="y", alpha=0.3)
     axis.legend(title="evaluated on", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.savefig(path)
+    write_figure(path, figure)

@@ -5,8 +5,6 @@ Beside the last checkpoint there is the best: the one at which the mean return o
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -16,9 +14,10 @@ from typing import Any
 import torch
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import whole_file
 from pbfd_torch.learning import curve
+from pbfd_torch.learning.checkpoint import FORMAT, load_checkpoint
 
-FORMAT = "pbfd_torch policy 1"
 PICTURE_EVERY = 30.0  # [s]
 CHECKPOINT, BEST, CURVE, PICTURE = "checkpoint.pt", "best.pt", "curve.csv", "curve.png"
 
@@ -40,9 +39,12 @@ class Folder:
             self.saved = load_checkpoint(checkpoint)
             if self.saved["method"] != method:
                 raise InputError(f"'{path}' holds a training by {self.saved['method']}: go on with that, or choose another folder")
-            self.rows = [curve.Row(**row) for row in self.saved["rows"]]
+            self.rows = curve.rows_of(self.saved["rows"])
             self.seconds = self.saved["seconds"]
-            torch.set_rng_state(self.saved["random"])
+            try:
+                torch.set_rng_state(self.saved["random"])
+            except RuntimeError as error:
+                raise InputError(f"'{checkpoint}' is not a usable checkpoint: random is no state of torch's generator") from error
         path.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -56,24 +58,20 @@ class Folder:
 
     def write(self, settings: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
         """Everything there is to go on with. `settings` holds those of the environment under "env", and the networks' "width"."""
-        part = self.path / f"{CHECKPOINT}.part"
-        torch.save(
-            {
-                "format": FORMAT,
-                "method": self.method,
-                "settings": dict(settings),
-                "rows": [asdict(row) for row in self.rows],
-                "seconds": self.seconds,
-                "random": torch.get_rng_state(),
-                **parts,
-            },
-            part,
-        )
+        content = {
+            "format": FORMAT,
+            "method": self.method,
+            "settings": dict(settings),
+            "rows": [asdict(row) for row in self.rows],
+            "seconds": self.seconds,
+            "random": torch.get_rng_state(),
+            **parts,
+        }
         means = [x for x in curve.trailing(self.rows) if not math.isnan(x)]
-        if means and means[-1] > max(means[:-1], default=-math.inf):
-            shutil.copyfile(part, self.path / f"{BEST}.part")
-            os.replace(self.path / f"{BEST}.part", self.path / BEST)
-        os.replace(part, self.path / CHECKPOINT)
+        best = means and means[-1] > max(means[:-1], default=-math.inf)
+        for name in (BEST, CHECKPOINT) if best else (CHECKPOINT,):
+            with whole_file(self.path / name) as file:
+                torch.save(content, file)
         curve.save(self.rows, self.path / CURVE)
         if time.monotonic() - self._drawn > PICTURE_EVERY:
             self.draw()
@@ -82,18 +80,3 @@ class Folder:
         """The picture of the curve so far: takes longer than the rest, so `write` does it now and then only."""
         curve.draw({self.method: self.rows}, self.path / PICTURE, self.title)
         self._drawn = time.monotonic()
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint's contents, without unpickling anything but plain data; raises `InputError` for what is none."""
-    try:
-        saved = torch.load(path, weights_only=True)
-        if saved.get("format") != FORMAT:
-            raise InputError(f"'{path}' has format {saved.get('format')!r}: must be {FORMAT!r}")
-    except FileNotFoundError:
-        raise InputError(f"no checkpoint at '{path}'") from None
-    except InputError:
-        raise
-    except Exception as error:  # pickle, zipfile and torch raise whatever they like on damaged files
-        raise InputError(f"'{path}' is not a readable checkpoint: {error}") from error
-    return dict(saved)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import math
 import time
 from dataclasses import dataclass, replace
@@ -49,6 +50,8 @@ class Ppo(Settings):
         super().__post_init__()
         if self.ray < 0 or (self.ray and self.workers > 1):
             raise InputError(f"ray is {self.ray} and workers {self.workers}: give one of the two")
+        if self.ray and importlib.util.find_spec("ray") is None:
+            raise InputError(f"ray is {self.ray}, but the package ray is not installed: pip install 'pbfd_torch[ray]'")
 
     @property
     def frames_per_batch(self) -> int:

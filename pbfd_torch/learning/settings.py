@@ -6,7 +6,10 @@ from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.learning.numbers import require_integer
 from pbfd_torch.learning.training_env import EnvSettings
+
+COUNTS, WIDTHS = (1, 10**12), (1, 4096)
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,7 @@ class Settings:
     decay: environment steps in which learning rates fall to a tenth; they stay there.
     gamma, lmbda, width: the usual ones; width: of both networks' two hidden layers.
 
-    Raises `InputError` for a discount outside [0, 1) and for counts below 1.
+    Raises `InputError` for a discount outside [0, 1), for counts below 1 and for widths over 4096.
     """
 
     counts: ClassVar[tuple[str, ...]] = ("horizon", "epochs", "decay", "width")
@@ -33,7 +36,6 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name in self.counts:
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}: must be ≥ 1")
+            require_integer(name, getattr(self, name), *(WIDTHS if name == "width" else COUNTS))
         if not 0 <= self.gamma < 1:
             raise InputError(f"gamma is {self.gamma}: must be from 0 to below 1")

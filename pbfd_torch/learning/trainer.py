@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 
+from pbfd_torch.errors import InputError
 from pbfd_torch.learning import curve
+from pbfd_torch.learning.checkpoint import checked_statistics, load_moments, load_weights
 from pbfd_torch.learning.folder import Folder
 from pbfd_torch.learning.networks import make_actor, make_critic
 from pbfd_torch.learning.settings import Settings
@@ -47,9 +49,19 @@ class Trainer(Generic[T]):
         """What checkpoints hold beside both networks; all of it goes on from the folder's checkpoint, where there is one."""
         self._learners |= learners
         if self.folder.saved is not None:
-            for name, learner in self._learners.items():
-                learner.load_state_dict(self.folder.saved[name])
-            self.shared.update_(self.folder.saved["statistics"])
+            try:
+                self._go_on(self.folder.saved)
+            except InputError as error:
+                raise InputError(f"'{self.folder.path}' does not hold what this training goes on from: {error}") from error
+
+    def _go_on(self, saved: Mapping[str, Any]) -> None:
+        name, width = saved["settings"]["env"]["name"], self.env.observation_spec["observation"].shape[-1]
+        if name != self.settings.env.name:
+            raise InputError(f"env is '{self.settings.env.name}': must be '{name}', as before")
+        for key, learner in self._learners.items():
+            load = load_moments if isinstance(learner, torch.optim.Optimizer) else load_weights
+            load(key, learner, saved.get(key))
+        self.shared.update_(checked_statistics(saved.get("statistics"), width))
 
     def _save(self, row: curve.Row, progress: Progress | None) -> None:
         """After a batch."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,16 +14,22 @@ from torch import Tensor
 from torchrl.envs import Compose, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import VecNormV2
 
-from pbfd_torch.envs import Randomization, make_env
+from pbfd_torch.envs import ENVIRONMENTS, Randomization, make_env
+from pbfd_torch.errors import InputError
 from pbfd_torch.learning.networks import SEEN
+from pbfd_torch.learning.numbers import require_integer, require_real
+from pbfd_torch.stepping.stepper import SHORTEST_STEP
 
+LONGEST_STEP = 1.0  # [s] between actions
 _DECAY = 0.99995  # of the running mean and variance, per step of all worlds
 _LEAST = 1e-4  # scale
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Which environment, and how: see `PbfdEnv`. dtype: "float64" or "float32". randomization: of the worlds in training."""
+    """Which environment, and how: see `PbfdEnv`. dtype: "float64" or "float32". randomization: of the worlds in training.
+
+    Raises `InputError` naming the setting that is out of range."""
 
     name: str
     num_envs: int = 64
@@ -33,11 +40,32 @@ class EnvSettings:
     max_episode_steps: int | None = None
     randomization: Randomization | None = None
 
+    def __post_init__(self) -> None:
+        if self.name not in list(ENVIRONMENTS):
+            raise InputError(f"no environment named {reprlib.repr(self.name)}: must be one of {', '.join(ENVIRONMENTS)}")
+        if self.dtype not in ("float64", "float32"):
+            raise InputError(f"dtype is {reprlib.repr(self.dtype)}: must be float64 or float32")
+        require_integer("num_envs", self.num_envs, 1, 2**31)
+        require_integer("seed", self.seed, 0, 2**64 - 1)
+        for name in ("control_dt", "dt"):
+            if getattr(self, name) is not None:
+                require_real(f"{name} [s]", getattr(self, name), SHORTEST_STEP, LONGEST_STEP)
+        if self.max_episode_steps is not None:
+            require_integer("max_episode_steps", self.max_episode_steps, 1, 10**6)
+
     @staticmethod
     def of(saved: Mapping[str, Any]) -> EnvSettings:
-        """The settings that `asdict` has made plain."""
+        """The settings that `asdict` has made plain. Raises `InputError` for what it has not."""
+        if wrong := set(saved) - {x.name for x in fields(EnvSettings)} or {"name"} - set(saved):
+            raise InputError(f"the settings of an environment hold or lack {', '.join(sorted(map(str, wrong)))}")
         chances = saved.get("randomization")
-        return EnvSettings(**{**saved, "randomization": chances and Randomization(**chances)})
+        try:
+            randomization = None if chances is None else Randomization(**chances)
+        except InputError:
+            raise
+        except (TypeError, ValueError) as error:  # other entries, or of other kinds
+            raise InputError(f"randomization is {reprlib.repr(chances)}: {error}") from error
+        return EnvSettings(**{**saved, "randomization": randomization})
 
     def make(self, **changes: Any) -> Any:
         """The environment itself."""
@@ -54,7 +82,7 @@ def location_and_scale(statistics: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """What the normaliser subtracts and divides by, `[nobs]` each, from its running sums, which start at zero."""
     loc, var, count = (statistics[name]["observation"] for name in ("loc", "var", "count"))
     weight = 1 - _DECAY ** count.double()
-    scale = ((var - loc.square()) / weight).sqrt().clamp_min(_LEAST)
+    scale = ((var - loc.square()) / weight).clamp_min(_LEAST**2).sqrt()
     return (loc / weight).float(), scale.float()
 
 

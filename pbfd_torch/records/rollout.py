@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
-import tempfile
-import tokenize
-import zipfile
-import zlib
+import reprlib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.looks.appearance import Appearance, packed, unpacked
-from pbfd_torch.solvers.objective import FALLBACKS, is_solved
+from pbfd_torch.records import archive
+from pbfd_torch.records.consistency import require_drawable, require_fitting, require_plausible
+from pbfd_torch.solvers.objective import is_solved
 
 FORMAT = "pbfd_torch rollout 6"
-LARGEST = 2**35  # [bytes] of all arrays of a file together: what claims more is refused rather than read
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,87 +119,63 @@ class Rollout:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all.
         Raises `InputError` where it cannot be written."""
-        target = Path(path)
         words, surfaces = packed(self.appearance)
         meta = {"format": FORMAT, "scene_name": self.scene_name, "dt": self.dt, "appearance": words}
         meta |= {name: list(getattr(self, name)) for name in _NAMES}
-        arrays = {name: getattr(self, name).cpu().numpy() for name in _ARRAYS} | surfaces
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            # written beside the target and renamed: the folder goes with whatever an interruption leaves in it
-            with tempfile.TemporaryDirectory(dir=target.parent, prefix=".rollout-") as folder:
-                part = Path(folder) / "rollout.npz"
-                np.savez_compressed(part, meta=np.array(json.dumps(meta)), **arrays)
-                os.replace(part, target)
-        except OSError as error:
-            raise InputError(f"cannot write '{target}': {error.strerror or error}") from error
+        archive.write(path, meta, {name: value.cpu().numpy() for name, value in self._arrays().items()} | surfaces)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Rollout:
         """Reads what `save` wrote; never unpickles. Raises `InputError` for a file that is missing, damaged, foreign or of another
-        version, that claims more than 32 GiB, or whose arrays do not fit each other."""
+        version, that claims more than half of the memory that is available, whose arrays do not fit each other, or whose poses are
+        not finite."""
         try:
-            found: Any = np.load(path, allow_pickle=False)
-            if isinstance(found, np.ndarray):
-                raise InputError(f"'{path}' is not a readable rollout: it is a single array")
-            with found as file:
-                size = sum(entry.file_size for entry in file.zip.infolist())
-                if size > LARGEST:
-                    raise InputError(f"'{path}' claims {size / 2**30:.3g} GiB: must be at most {LARGEST / 2**30:.0f}")
-                meta = json.loads(str(file["meta"]))
-                if meta.get("format") != FORMAT:
-                    raise InputError(f"'{path}' has format {meta.get('format')!r}: must be {FORMAT!r}")
-                fields: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
-                fields |= {name: tuple(map(str, meta[name])) for name in _NAMES}
-                surfaces = {name: file[name] for name in ("visual_vertices", "visual_faces")}
-            links = len(fields["link_names"])
-            seen = unpacked(meta["appearance"], surfaces, links, links + fields["obstacle_poses"].shape[-3])
-            rollout = Rollout(scene_name=str(meta["scene_name"]), dt=float(meta["dt"]), appearance=seen, **fields)
-            rollout.require_consistent()
+            meta, arrays = archive.read(path, FORMAT, (*_ARRAYS, *_SURFACES))
+            return _made(meta, arrays)
         except FileNotFoundError as error:
             raise InputError(f"no rollout at '{path}'") from error
         except InputError as error:
-            raise InputError(str(error) if str(path) in str(error) else f"'{path}' is not a readable rollout: {error}") from error
-        except _UNREADABLE as error:
-            raise InputError(f"'{path}' is not a readable rollout: {type(error).__name__} {error}") from error
-        return rollout
+            raise InputError(f"'{path}' is not a readable rollout: {error}") from error
 
     def require_consistent(self) -> None:
-        """Raises `InputError` naming the first array whose shape or type does not fit the others."""
-        if self.q.ndim < 2 or len(self.q) < 2 or not (math.isfinite(self.dt) and self.dt > 0):
-            raise InputError(f"q has shape {tuple(self.q.shape)} and dt is {self.dt} s: must be [T + 1 ≥ 2, *batch, nq], and > 0")
-        batch, steps = tuple(self.q.shape[1:-1]), len(self.q) - 1
-        slots = self.contact_depth.shape[-1:]
-        states: dict[str, tuple[int, ...]] = {
-            "v": self.v.shape[-1:],
-            "link_poses": (len(self.link_names), 3, 4),
-            "center_of_mass": (3,),
-        }
-        states |= {"linear_momentum": (3,), "angular_momentum": (3,), "kinetic_energy": (), "potential_energy": ()}
-        solves: dict[str, tuple[int, ...]] = dict.fromkeys(
-            ("status", "iterations", "evaluations", "residual_norm", "hazards", "suspect", "substeps"), ()
-        )
-        solves |= {"fallbacks": (len(FALLBACKS),), "contact_depth": slots}
-        solves |= {f"contact_{what}": (*slots, 3) for what in ("point", "normal", "force", "slip")}
-        expected = {name: (steps + 1, *batch, *shape) for name, shape in states.items()}
-        expected |= {name: (steps, *batch, *shape) for name, shape in solves.items()}
-        moving = len(self.obstacle_poses) if len(self.obstacle_poses) == 1 else steps + 1
-        expected |= {"time": (steps + 1,), "lanes": (), "obstacle_poses": (moving, *batch, *self.obstacle_poses.shape[-3:-2], 3, 4)}
-        for name, shape in expected.items():
-            value: Tensor = getattr(self, name)
-            if tuple(value.shape) != tuple(shape):
-                raise InputError(f"{name} has shape {tuple(value.shape)}: must be {tuple(shape)}")
-            if value.is_floating_point() == (name in _COUNTS):
-                raise InputError(f"{name} is {value.dtype}: must be {'integers' if name in _COUNTS else 'floating-point numbers'}")
-        if bool(((self.suspect < -1) | (self.suspect >= len(self.dangers))).any()):
-            raise InputError(f"suspect holds {self.suspect.unique().tolist()}: must be from -1 to {len(self.dangers) - 1}")
+        """Raises `InputError` naming the first array whose shape, type or values do not fit the others, with step and world of a
+        value. Times, configurations, poses and centres of mass must be finite; everything else in steps that are solved."""
+        if not (math.isfinite(self.dt) and self.dt > 0):
+            raise InputError(f"dt is {self.dt} s: must be > 0 and finite")
+        arrays = self._arrays()
+        require_fitting(arrays, len(self.link_names))
+        require_plausible(arrays, len(self.dangers))
+        require_drawable(self.appearance, self.q.shape[-1])
+
+    def _arrays(self) -> dict[str, Tensor]:
+        return {name: getattr(self, name) for name in _ARRAYS}
 
 
-# what numpy and zipfile raise on damaged files, and what a foreign `meta` leads to
-_UNREADABLE = (
-    OSError, ValueError, LookupError, AttributeError, TypeError, EOFError, RuntimeError, RecursionError, MemoryError,
-    zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
-)  # fmt: skip
+def _made(meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Rollout:
+    """Of a file's contents. Raises `InputError` where they are not those of a rollout."""
+    for name, (kind, wanted) in _MEANT.items():
+        if not isinstance(meta.get(name), kind) or isinstance(meta[name], bool):
+            raise InputError(f"its {name} is {reprlib.repr(meta.get(name))}: must be {wanted}")
+    names: dict[str, Any] = {name: tuple(map(str, meta[name])) for name in _NAMES}
+    try:
+        fields: dict[str, Any] = {name: torch.from_numpy(arrays[name]) for name in _ARRAYS}
+        links = len(names["link_names"])
+        seen = unpacked(meta["appearance"], arrays, links, links + fields["obstacle_poses"].shape[-3])
+    except InputError:
+        raise
+    except archive.UNREADABLE as error:  # parts of the wrong kind
+        raise InputError(f"{type(error).__name__} {error}") from error
+    rollout = Rollout(scene_name=meta["scene_name"], dt=float(meta["dt"]), appearance=seen, **names, **fields)
+    rollout.require_consistent()
+    return rollout
+
+
 _ARRAYS = [f.name for f in dataclasses.fields(Rollout) if f.type == "Tensor"]
-_COUNTS = {"status", "iterations", "evaluations", "fallbacks", "hazards", "suspect", "substeps", "lanes"}
+_SURFACES = ("visual_vertices", "visual_faces")
 _NAMES = ("link_names", "joint_names", "dangers")
+_MEANT: dict[str, tuple[Any, str]] = {
+    "scene_name": (str, "a text"),
+    "dt": (int | float, "a number"),
+    "appearance": (dict, "an object"),
+}
+_MEANT |= dict.fromkeys(_NAMES, (list, "a list"))

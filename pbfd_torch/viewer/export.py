@@ -18,6 +18,7 @@ import viser
 from numpy.typing import NDArray
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.files import write_whole
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.browser import page
@@ -188,9 +189,6 @@ def _checked(target: Path, suffixes: tuple[str, ...]) -> Path:
 def _write(target: Path, content: bytes) -> None:
     """The whole file or none."""
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        part = target.with_name(f".{target.name}.part")
-        part.write_bytes(content)
-        os.replace(part, target)
+        write_whole(target, content)
     except OSError as error:
         raise InputError(f"cannot write '{target}': {error.strerror or error}") from error

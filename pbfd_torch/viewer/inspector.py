@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import viser
 
 from pbfd_torch.records.rollout import Rollout
@@ -18,12 +20,20 @@ class Inspector(Served):
     """Shows a rollout, and a `ghost` over it, at an `address` for browsers, until `close`.
 
     host, port: where; by default only this computer can see it, and the next free port is taken where the wanted one is not free.
-    Raises `InputError` for a host or port that cannot be used, and for a ghost with other links."""
+    origins: of web pages elsewhere that may connect, see `viewer.origins`. Raises `InputError` for a host, port or origin that
+    cannot be used, and for a ghost with other links."""
 
-    def __init__(self, rollout: Rollout, ghost: Rollout | None = None, host: str = serving.HOST, port: int = serving.PORT) -> None:
+    def __init__(
+        self,
+        rollout: Rollout,
+        ghost: Rollout | None = None,
+        host: str = serving.HOST,
+        port: int = serving.PORT,
+        origins: Sequence[str] = (),
+    ) -> None:
         super().__init__()
         self.film, self._ghost = Film(rollout), None if ghost is None else Film(ghost)
-        self.server = serving.start(host, port)
+        self.server = serving.start(host, port, origins=origins)
         try:
             self.stage = Stage(self.server, self.film, self._ghost)
             self._build(self.server.gui)

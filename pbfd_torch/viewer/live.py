@@ -6,6 +6,7 @@ import dataclasses
 import math
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -40,8 +41,8 @@ class Live(Served):
     """Steps world 0 of a setup in real time at an `address`, until `close`.
 
     dt: step [s], None: the scene's; integrator: one of `INTEGRATORS`. Sliders: control of the scene's actuators, or joint targets
-    where it has none, a push on a chosen link, μ; Δt and integrator to choose; buttons: pause, reset. Raises `InputError` for what
-    is out of range."""
+    where it has none, a push on a chosen link, μ; Δt and integrator to choose; buttons: pause, reset. host, port, origins: as of
+    `Inspector`. Raises `InputError` for what is out of range."""
 
     def __init__(
         self,
@@ -50,6 +51,7 @@ class Live(Served):
         integrator: str = "energy-momentum",
         host: str = serving.HOST,
         port: int = serving.PORT,
+        origins: Sequence[str] = (),
     ) -> None:
         if integrator not in INTEGRATORS:
             raise InputError(f"integrator is '{integrator}': must be one of {', '.join(INTEGRATORS)}")
@@ -68,7 +70,7 @@ class Live(Served):
         self._rebuild(*self._start)
         self.film = Film(self._record(*self._advanced()))
         self._rebuild(*self._start)
-        self.server = serving.start(host, port)
+        self.server = serving.start(host, port, origins=origins)
         try:
             self.stage = Stage(self.server, self.film)
             self.stage.contacts.points = self.stage.contacts.forces = True

@@ -6,25 +6,27 @@ import contextlib
 import io
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import viser
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.viewer.origins import checked_origins, guarded
 
 HOST, PORT = "127.0.0.1", 8080
 _TRIES = 100
 
 
-def start(host: str = HOST, port: int = PORT, quiet: bool = False) -> viser.ViserServer:
-    """A server at a port, or at the next free one, which is then said on stderr unless `quiet`. Raises `InputError` for a host or
-    port that cannot be used."""
+def start(host: str = HOST, port: int = PORT, quiet: bool = False, origins: Sequence[str] = ()) -> viser.ViserServer:
+    """A server at a port, or at the next free one, which is then said on stderr unless `quiet`. `origins`: of web pages elsewhere
+    that may connect, such as "https://hub.example.org". Raises `InputError` for a host, port or origin that cannot be used."""
+    named = checked_origins(origins)
     if not 1 <= port <= 65535:
         raise InputError(f"port is {port}: must be from 1 to 65535")
     free = _free_port(host, port)
     if free != port and not quiet:
         print(f"pbfd: port {port} is taken: using {free}", file=sys.stderr)
-    with _quiet():
+    with _quiet(), guarded(host, named):
         server = viser.ViserServer(host=host, port=free, label="pbfd_torch", verbose=False)
     server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, brand_color=(31, 106, 165))
     server.gui.main_panel.dock_right()
