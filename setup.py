@@ -29,7 +29,7 @@ X86 = {f"x86-64-{level}": [f"-march=x86-64-{level}"] for level in ("v2", "v3", "
 ARM = {"arm64": []}  # every 64-bit ARM has NEON
 VARIANTS = {"x86_64": X86, "AMD64": X86, "arm64": ARM, "aarch64": ARM}
 
-# A result must be the same on every processor: the compiler fuses no multiply-adds by itself; the sources say where.
+# The compiler fuses no products and sums by itself: the sources say where, so that one lane rounds as eight do.
 FLAGS = [
     *("-std=c++17", "-O3", "-fno-math-errno", "-ffp-contract=off", "-fno-exceptions", "-fno-rtti", "-Wall", "-Wextra"),
     *("-shared", "-fPIC", "-fvisibility=hidden", "-fvisibility-inlines-hidden"),
