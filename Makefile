@@ -3,11 +3,12 @@
 PYTHON ?= python3
 PYTEST_ARGS ?= -n 2
 BIN := .venv/bin
+NATIVE := $(wildcard pbfd_torch/native/src/*)
 
 # One thread each: matrices are small, and the workers share the cores.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test fuzz lint format notebooks clean
+.PHONY: demo test fuzz sanitize lint format notebooks clean
 
 demo: .venv/.installed
 	$(BIN)/pbfd demo --out demo
@@ -19,6 +20,15 @@ test: .venv/.installed
 fuzz: .venv/.installed
 	$(BIN)/python -m pytest $(PYTEST_ARGS) tests/fuzz --hypothesis-profile=long
 
+# The native core's own tests, in C++, under AddressSanitizer and UndefinedBehaviorSanitizer.
+sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/native/*.cpp))
+	set -e; for test in $^; do echo $$test; $$test; done
+
+build/sanitized/%: tests/native/%.cpp tests/native/check.h $(NATIVE)
+	mkdir -p $(@D)
+	$(CXX) -std=c++17 -O1 -g -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
+		-Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<
+
 lint: .venv/.installed
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -28,13 +38,14 @@ format: .venv/.installed
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
-.venv/.installed: pyproject.toml constraints.txt
+.venv/.installed: pyproject.toml constraints.txt setup.py $(NATIVE)
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install -c constraints.txt -e '.[dev]'
+	@cat pbfd_torch/native/lib/none.txt 2>/dev/null || true # pip does not say it
 	touch $@
 
 notebooks: .venv/.installed
 	$(BIN)/jupytext --to ipynb notebooks/*.py
 
 clean:
-	rm -rf .venv build dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv build dist demo pbfd_torch/native/lib *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -23,7 +23,7 @@ from tests.gymnasium_files import gymnasium_file
 pbfd = pytest.fixture(caller)
 INFO_KEYS = {
     *("name", "nq", "nv", "nu", "mass_kg", "gravity_m_s2", "links", "joints"),
-    *("actuators", "unlimited_actuators", "obstacles", "keyframes", "terms", "not_modelled"),
+    *("actuators", "unlimited_actuators", "obstacles", "keyframes", "terms", "not_modelled", "native_library"),
 }
 
 

@@ -17,6 +17,7 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.errors import InputError
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES
+from pbfd_torch.native.library import library, reason
 from pbfd_torch.terms.joint_springs import Armature, JointDamping
 
 
@@ -28,7 +29,7 @@ def run(file: str, free_base: bool | None, as_json: bool) -> None:
             raise InputError(f"'{file}' is a scene made in code: give a URDF or MJCF file")
         file = str(shipped)
     robot = load_robot(file, free_base=free_base)
-    contents = describe(robot)
+    contents = describe(robot) | {"native_library": _native_library()}
     if as_json:
         print(json.dumps(contents))
     else:
@@ -93,6 +94,13 @@ def _obstacle(obstacle: HalfSpace | Obstacle) -> dict[str, Any]:
     return {"name": obstacle.name, "shape": type(obstacle.shape).__name__, "position_m": position}
 
 
+def _native_library() -> dict[str, Any]:
+    """The compiled core: its target and how many worlds a register holds, or why there is none."""
+    found = library()
+    lanes = {str(dtype).removeprefix("torch."): found.lanes(dtype) for dtype in (torch.float64, torch.float32)} if found else {}
+    return {"target": found and found.target, "lanes": lanes, "reason": reason()}
+
+
 def _finite(value: torch.Tensor) -> float | None:
     return float(value) if bool(torch.isfinite(value)) else None
 
@@ -146,4 +154,9 @@ def _print(contents: dict[str, Any]) -> None:
             else f"at {_written(obstacle['position_m'])}"
         )
         print(f"obstacle: {obstacle['name']}, {obstacle['shape']} {place}")
+    native = contents["native_library"]
+    print(
+        "native library:",
+        f"{native['target']}, {native['lanes']['float64']} lanes of float64" if native["target"] else f"none: {native['reason']}",
+    )
     print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"))
