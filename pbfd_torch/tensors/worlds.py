@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.facts import known
@@ -45,6 +46,21 @@ class Worlds:
     def rows(self, value: Tensor) -> Tensor:
         """Rows `[n, *event]` of a value `[*batch, *event]` that has all the batch's dimensions."""
         return self.pick(value, value.ndim - len(self.batch))
+
+
+@dataclass(frozen=True, eq=False)
+class Census(Worlds):
+    """Takes no worlds of anything, and notes for how many it has values: `shapes`, the leading ones of all that it is shown."""
+
+    batch: tuple[int, ...] = ()
+    index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
+    shapes: list[tuple[int, ...]] = field(default_factory=list)
+
+    def pick(self, value: Any, rank: int) -> Any:
+        """The value itself."""
+        if isinstance(value, Tensor):
+            self.shapes.append(tuple(value.shape[: max(value.ndim - rank, 0)]))
+        return value
 
 
 def replaced(instance: Instance, **changes: Any) -> Instance:
