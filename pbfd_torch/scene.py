@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
+from pbfd_torch.checked import Array, as_tensor, broadcast_batches, require_bounded, require_shape
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.looks.appearance import Visual
-from pbfd_torch.tensors.checked import Array, as_tensor, broadcast_batches, require_bounded, require_shape
 from pbfd_torch.tensors.worlds import Census, Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia

@@ -9,6 +9,7 @@ from typing import Any, Generic, Self
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
+from pbfd_torch.checked import Array
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linearization import Linearization, linearized
@@ -22,7 +23,6 @@ from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.stepping.eager import MOST_EVALUATIONS, EagerStepper
 from pbfd_torch.stepping.stepper import Solver, Stepper
-from pbfd_torch.tensors.checked import Array
 from pbfd_torch.tree.articulation import Articulation
 
 

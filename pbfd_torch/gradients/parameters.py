@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.checked import Array, as_tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.scene import Scene
-from pbfd_torch.tensors.checked import Array, as_tensor
 from pbfd_torch.tensors.plain import wrapped
 from pbfd_torch.tensors.structures import fields_of
-from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.tensors.worlds import Census, replaced
 
 _PARTS = ("articulation", "terms", "gravity")  # of a scene: what a step knows of it
 _UNBOUNDED = ("lower", "upper", "control_range", "force_range")  # infinite where there is no bound
@@ -44,7 +44,10 @@ def with_parameters(scene: Scene, values: Mapping[str, Array]) -> Scene:
     unknown = values.keys() - known.keys()
     if unknown:
         raise InputError(f"no parameter named {', '.join(sorted(unknown))}: the names are {', '.join(known)}")
-    left = {name: _checked(name, value, known[name]) for name, value in values.items()}
+    census = Census()
+    scene.take(census)
+    ranks = {id(value): rank for value, rank in census.shown}
+    left = {name: _checked(name, value, known[name], ranks.get(id(known[name]))) for name, value in values.items()}
     seen = not any(wrapped(x) for x in left.values())
     made: list[Any] = []
     parts = {part: _changed(getattr(scene, part), part, left, made) for part in _PARTS}
@@ -56,12 +59,22 @@ def with_parameters(scene: Scene, values: Mapping[str, Array]) -> Scene:
     return changed
 
 
-def _checked(name: str, value: Array, present: Tensor) -> Tensor:
+def _checked(name: str, value: Array, present: Tensor, rank: int | None) -> Tensor:
+    """The value as a tensor. rank: how many of its last dimensions are the parameter's own; None: it is the same in all worlds."""
     tensor = as_tensor(name, value, present.dtype, present.device)
-    if present.ndim and (tensor.ndim == 0 or tensor.shape[-1] not in (1, present.shape[-1])):
-        raise InputError(
-            f"{name} has shape {tuple(tensor.shape)}: must end in {present.shape[-1]}, after the number of worlds if any"
+    shape, known = tuple(tensor.shape), tuple(present.shape)
+    event = known if rank is None else known[len(known) - rank :]
+    if present.ndim == 0:
+        fits, must = not shape or shape[-1] == 1, "be of one number, or of one for each world: (*worlds, 1)"
+    elif rank is None:
+        fits, must = shape == known, f"have shape {known}, the same in all worlds"
+    else:
+        fits, must = (
+            len(shape) >= rank and shape[len(shape) - rank :] == event,
+            f"end in {event}, after the number of worlds if any",
         )
+    if not fits:
+        raise InputError(f"{name} has shape {shape}: must {must}")
     if not wrapped(tensor):
         bounded = name.rpartition(".")[2] not in _UNBOUNDED
         fine = torch.isfinite(tensor) if bounded else ~torch.isnan(tensor)

@@ -50,17 +50,22 @@ class Worlds:
 
 @dataclass(frozen=True, eq=False)
 class Census(Worlds):
-    """Takes no worlds of anything, and notes for how many it has values: `shapes`, the leading ones of all that it is shown."""
+    """Takes no worlds of anything, and notes what it is shown: tensors, and how many of their last dimensions are their own."""
 
     batch: tuple[int, ...] = ()
     index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
-    shapes: list[tuple[int, ...]] = field(default_factory=list)
+    shown: list[tuple[Tensor, int]] = field(default_factory=list)
 
     def pick(self, value: Any, rank: int) -> Any:
         """The value itself."""
         if isinstance(value, Tensor):
-            self.shapes.append(tuple(value.shape[: max(value.ndim - rank, 0)]))
+            self.shown.append((value, min(rank, value.ndim)))
         return value
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """For how many worlds there are values."""
+        return [tuple(value.shape[: value.ndim - rank]) for value, rank in self.shown]
 
 
 def replaced(instance: Instance, **changes: Any) -> Instance:
