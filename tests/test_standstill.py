@@ -67,7 +67,8 @@ def assert_same(state: State, expected: State, solution: Solution, wanted: Solut
 def of(solution: Solution, worlds: Worlds) -> Solution:
     """That of some worlds."""
     names = ("q", "status", "evaluations", "iterations", "residual_norm", "fallbacks")
-    return dataclasses.replace(solution, **{name: worlds.rows(getattr(solution, name)) for name in names})
+    rows: dict[str, Any] = {name: worlds.rows(getattr(solution, name)) for name in names}
+    return dataclasses.replace(solution, **rows)
 
 
 @pytest.mark.parametrize("poison", POISONS)

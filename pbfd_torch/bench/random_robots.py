@@ -79,9 +79,7 @@ class RandomRobot:
     def _link(self, number: int) -> Link:
         parent = f"link{self._pick(number)}" if number else ""
         kinds = _JOINTS[self._pick(len(_JOINTS))] if number else (_ROOTS[self._pick(len(_ROOTS))],)
-        joints = tuple(
-            Joint(f"joint{number}_{k}", kind, axis=self._vector(1.0), **self._limits(kind)) for k, kind in enumerate(kinds)
-        )
+        joints = tuple(self._joint(f"joint{number}_{k}", kind) for k, kind in enumerate(kinds))
         mass = math.exp(self._uniform(-3.0, 1.0))
         moments = [mass * self._uniform(0.02, 0.08) ** 2 for _ in range(3)]
         x, y, z = (sum(moments) - moment for moment in moments)
@@ -95,10 +93,10 @@ class RandomRobot:
             inertia=((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z)),
         )
 
-    def _limits(self, kind: JointKind) -> dict[str, float]:
-        if kind is JointKind.SLIDE:
-            return {"lower": -0.1, "upper": 0.1}
-        return {"lower": -1.5, "upper": 1.5} if kind is JointKind.HINGE and self._pick(2) else {}
+    def _joint(self, name: str, kind: JointKind) -> Joint:
+        """Slides have limits, and every other hinge."""
+        limit = {JointKind.SLIDE: 0.1, JointKind.HINGE: 1.5 if self._pick(2) else math.inf}.get(kind, math.inf)
+        return Joint(name, kind, axis=self._vector(1.0), lower=-limit, upper=limit)
 
     def _shape(self) -> Shape:
         a, b, c = (self._uniform(0.03, 0.09) for _ in range(3))
