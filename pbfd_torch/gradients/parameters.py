@@ -64,15 +64,14 @@ def _checked(name: str, value: Array, present: Tensor, rank: int | None) -> Tens
     tensor = as_tensor(name, value, present.dtype, present.device)
     shape, known = tuple(tensor.shape), tuple(present.shape)
     event = known if rank is None else known[len(known) - rank :]
-    if present.ndim == 0:
-        fits, must = not shape or shape[-1] == 1, "be of one number, or of one for each world: (*worlds, 1)"
+    if present.numel() == 1 and not shape:
+        fits, must = True, ""
+    elif present.ndim == 0:
+        fits, must = shape[-1] == 1, "be of one number, or of one for each world: (*worlds, 1)"
     elif rank is None:
         fits, must = shape == known, f"have shape {known}, the same in all worlds"
     else:
-        fits, must = (
-            len(shape) >= rank and shape[len(shape) - rank :] == event,
-            f"end in {event}, after the number of worlds if any",
-        )
+        fits, must = shape[max(len(shape) - rank, 0) :] == event, f"end in {event}, after the number of worlds if any"
     if not fits:
         raise InputError(f"{name} has shape {shape}: must {must}")
     if not wrapped(tensor):
