@@ -384,3 +384,18 @@ def test_no_pairs() -> None:
     none = torch.zeros(0, dtype=torch.long)
     found = find((CUBE,), none, none, torch.zeros(0, 4, 4, dtype=F64), torch.zeros(0, 4, 4, dtype=F64))
     assert found.points.shape == (0, 8, 3)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e160, 1e308])
+def test_fcl_sees_no_absurd_places(bad: float) -> None:
+    """FCL crashes where a body is nowhere, or too far for its numbers: such rows never reach it, and the others are as without."""
+    polytopes = [polytope_of(shape) for shape in SOLIDS]
+    table, geometries = PolytopeTable.stack(polytopes), fcl_geometries(polytopes)
+    a, b, pose_a, pose_b = random_pairs(len(SOLIDS), 12, 0.4, 5)
+    expected = fcl_separation(table, geometries, a, b, pose_a, pose_b)
+    absurd = pose_a.clone()
+    absurd[3, 0, 3] = bad
+    found = fcl_separation(table, geometries, a, b, absurd, pose_b)
+    others = torch.arange(12) != 3
+    assert torch.equal(found.normal[others], expected.normal[others])
+    assert torch.equal(found.distance[others], expected.distance[others])

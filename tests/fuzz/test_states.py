@@ -77,7 +77,7 @@ class Run:
 def run(of: Scene, dt: float, given: dict[str, Any]) -> Run:
     """A few steps."""
     push = Pushes.at_centers(of.articulation, given["push"])
-    simulator = Simulator(dataclasses.replace(of, terms=(*of.terms[:-1], push)), dt, evaluations=200)
+    simulator = Simulator(dataclasses.replace(of, terms=(*of.terms[:-1], push)), dt, halvings=1, evaluations=200)
     state = simulator.initial_state(given["q"], given["v"])
     found = Run([], [])
     for _ in range(STEPS):
