@@ -9,16 +9,18 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.balance.dynamics import kinetic_energy, mass_matrix, potential_energy, rotor_energy
+from pbfd_torch.checked import Array, as_tensor, broadcast_batches, require_bounded, require_shape
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Collider
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.looks.appearance import Visual
-from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tensors.worlds import Census, Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Conservative, Term
 from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.bounds import FARTHEST, FASTEST, SHORTEST_QUATERNION
 from pbfd_torch.tree.kinematics import Motion, Placement, place
 
 
@@ -82,25 +84,54 @@ class Scene:
         """Length of the control vector."""
         return sum(term.nu for term in self.terms if isinstance(term, Actuators))
 
-    def placed(self, q: Tensor | None, v: Tensor | None) -> tuple[Tensor, Tensor]:
+    def placed(self, q: Array | None, v: Array | None) -> tuple[Tensor, Tensor]:
         """Configuration `[*batch, nq]` and velocity `[*batch, nv]` of all worlds, quaternions at unit norm, from those given for
-        one or for all; None: the rest configuration, and rest. Raises `InputError` for wrong shapes, dtypes, devices or NaN."""
+        one or for all; None: the rest configuration, and rest. Raises `InputError` for wrong shapes, dtypes or devices, for NaN and
+        infinity, for coordinates beyond `FARTHEST` and velocities beyond `FASTEST` (`tree.bounds`), and for quaternions of no
+        length."""
         a = self.articulation
-        q = a.rest if q is None else self._checked(q, a.nq, "q")
-        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v")
-        parameters = (self.gravity.shape[:-1], a.pseudo_inertia.shape[:-3], place(a, a.rest).poses.shape[:-3])
-        batch = torch.broadcast_shapes(q.shape[:-1], v.shape[:-1], *parameters)
+        q = a.rest if q is None else self._checked(q, a.nq, "q", FARTHEST, "m or rad")
+        v = q.new_zeros((*q.shape[:-1], a.nv)) if v is None else self._checked(v, a.nv, "v", FASTEST, "m/s or rad/s")
+        length = torch.linalg.vector_norm(q.detach()[..., a.topology.turning_q], dim=-1)
+        if not bool((length >= SHORTEST_QUATERNION).all()):
+            raise InputError(
+                f"q holds a quaternion of length {float(length.min()):g}: must be ≥ {SHORTEST_QUATERNION:g}, and is scaled to 1"
+            )
+        batch = broadcast_batches(
+            {
+                "q": q.shape[:-1],
+                "v": v.shape[:-1],
+                "gravity": self.gravity.shape[:-1],
+                "masses": a.pseudo_inertia.shape[:-3],
+                "frames": place(a, a.rest).poses.shape[:-3],
+            }
+        )
+        for term in self.terms:
+            census = Census()
+            term.take(census)
+            for shape in census.shapes:
+                broadcast_batches({"q and v": batch, f"the {type(term).__name__}": shape})
         return a.topology.normalized(q.expand(*batch, a.nq)), v.expand(*batch, a.nv)
 
-    def _checked(self, value: Tensor, length: int, name: str) -> Tensor:
+    def _checked(self, value: Array, length: int, name: str, most: float, unit: str) -> Tensor:
+        tensor = as_tensor(name, value, self.articulation.dtype, self.articulation.device)
+        require_shape(name, tensor, (length,))
+        require_bounded(name, tensor, most, unit)
+        return tensor
+
+    def controlled(self, control: Array | None, batch: Sequence[int]) -> Tensor | None:
+        """The control of a step `[*batch, nu]`, given for one world or for all. Its numbers are not looked at: a world with NaN or
+        infinity stands still. Raises `InputError` for wrong shapes, dtypes or devices."""
+        if control is None:
+            return None
         a = self.articulation
-        if value.ndim == 0 or value.shape[-1] != length:
-            raise InputError(f"{name} has shape {tuple(value.shape)}: must end in ({length},)")
-        if value.dtype != a.dtype or value.device != a.device:
-            raise InputError(f"{name} is {value.dtype} on {value.device}: must be {a.dtype} on {a.device}")
-        if not bool(torch.isfinite(value).all()):
-            raise InputError(f"{name} holds NaN or infinity")
-        return value
+        tensor = as_tensor("control", control, a.dtype, a.device)
+        require_shape("control", tensor, (self.nu,))
+        if broadcast_batches({"control": tensor.shape[:-1], "the state": batch}) != tuple(batch):
+            raise InputError(
+                f"control has shape {tuple(tensor.shape)}: must be {(*batch, self.nu)}, or {(self.nu,)} for all worlds"
+            )
+        return tensor
 
     def step_count(self, controls: Tensor | None, steps: int | None) -> int:
         """Of a rollout with these controls, or without any; raises `InputError` where the two do not agree."""

@@ -9,6 +9,7 @@ from typing import Any, Generic, Self
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
+from pbfd_torch.checked import Array
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linearization import Linearization, linearized
@@ -28,8 +29,8 @@ from pbfd_torch.tree.articulation import Articulation
 class Simulator(Generic[S]):
     """Steps a scene.
 
-    `dt`: step [s] > 0, a number, or a scalar tensor where gradients by it are wanted; smaller than 1e-5 is refused because rounding
-    would dominate the positions' differences. `halvings`: how often a world's step may be halved (2, 4, 8 … shorter steps) where
+    `dt`: step [s] from 1e-5 to 100, a number, or a scalar tensor where gradients by it are wanted; in shorter ones rounding would
+    dominate the positions' differences. `halvings`: how often a world's step may be halved (2, 4, 8 … shorter steps) where
     nothing else solves it; 0: never. `evaluations`: the most that a world may spend on a step, with all that is tried; what is not
     solved by then is unsolved. `gradients`: how steps are differentiated (`gradients.implicit`).
 
@@ -98,13 +99,16 @@ class Simulator(Generic[S]):
         other.stepper = other.eager
         return other
 
-    def initial_state(self, q: Tensor | None = None, v: Tensor | None = None, control: Tensor | None = None) -> S:
+    def initial_state(self, q: Array | None = None, v: Array | None = None, control: Array | None = None) -> S:
         """State at configuration q `[*batch, nq]` (None: the rest configuration) and velocity v `[*batch, nv]` (None: at rest).
         One configuration goes to all worlds where the velocity, gravity or the articulation's parameters have several.
 
-        The start is of second order, or of first order in a world whose trial step is unsolved, if the integrator needs one. Raises
-        `InputError` for wrong shapes, dtypes, devices or NaN."""
+        Each may be a tensor of the scene's dtype and device, a numpy array or a list. The start is of second order, or of first
+        order in a world whose trial step is unsolved, if the integrator needs one. Raises `InputError` for wrong shapes, dtypes and
+        devices, for NaN and infinity, for coordinates beyond 1e9 (m, rad) and velocities beyond 1e6 (m/s, rad/s), and for
+        quaternions of no length."""
         q, v = self.scene.placed(q, v)
+        control = self.scene.controlled(control, q.shape[:-1])
         linked = Linked(self.eager, self.gradients)
         return linked.initial_state(q, v, control) if linked.carry(q, v, control) else self.stepper.initial_state(q, v, control)
 
@@ -112,13 +116,16 @@ class Simulator(Generic[S]):
         """The balance of forces that the step from `state` solves."""
         return self.eager.objective(state, control)
 
-    def step(self, state: S, control: Tensor | None = None) -> tuple[S, Solution]:
-        """One step of all worlds under `control` `[*batch, nu]` (None: zero). Never raises for one bad world: see the solution's
-        status. An unsolved world goes on from the best point found.
+    def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
+        """One step of all worlds under `control` `[*batch, nu]` (None: zero), a tensor, a numpy array or a list. Never raises for
+        one bad world: see the solution's status. An unsolved world goes on from the best point found. One whose state or control is
+        not finite or beyond the bounds (docs/SOLVERS.md) stands still, with the status `NON_FINITE`. Raises `InputError` for wrong
+        shapes, dtypes and devices.
 
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
         theorem (`gradients.implicit`); its values are the same to the bit."""
         linked = Linked(self.eager, self.gradients)
+        control = self.scene.controlled(control, state.q.shape[:-1])
         if linked.carry(state, control):
             advanced, made = linked.step(state, control)
             return advanced, made.solution
@@ -179,9 +186,10 @@ class AdaptiveSimulator(Simulator[S]):
         super().__init__(scene, dt, integrator, solver, halvings=0)
         self.stepper = AdaptiveStepper(self.eager, accuracy, shortest)
 
-    def step(self, state: S, control: Tensor | None = None) -> tuple[S, Solution]:
+    def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but
         not smoothly."""
+        control = self.scene.controlled(control, state.q.shape[:-1])
         if Linked(self.eager, self.gradients).carry(state, control):
             raise InputError(NO_DERIVATIVES)
         return super().step(state, control)

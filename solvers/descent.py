@@ -81,8 +81,10 @@ class Descent:
         error = objective.error(evaluation, self.tolerance_for(p.q.dtype))
         finite = torch.isfinite(error) & torch.isfinite(p.trial).all(-1)
         searching = p.stage == SEARCHING
-        retreating = p.running & (p.stage == AT_GUESS) & ~(finite & (error <= self.retreat_above))
-        lost = p.running & (p.stage == AT_RETREAT) & ~finite
+        good = finite & (error <= self.retreat_above)
+        refuge = torch.isfinite(p.retreat).all(-1)
+        retreating = p.running & (p.stage == AT_GUESS) & ~good & refuge
+        lost = p.running & ((p.stage == AT_RETREAT) | ((p.stage == AT_GUESS) & ~refuge)) & ~finite
         usable = p.running & finite & ~retreating
         arrived = usable & (error <= self.tolerance_for(p.q.dtype))
         status = torch.where(arrived, int(Status.SOLVED), p.status)

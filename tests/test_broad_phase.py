@@ -74,3 +74,16 @@ def test_worlds_do_not_see_each_other(kind: type[AllPairs | FclTree]) -> None:
     phase = of_all(kind, 12)
     together = phase.near(lower, upper)
     assert bool((together == torch.stack([phase.near(a, b) for a, b in zip(lower, upper, strict=True)])).all())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_nothing_is_near_what_is_not_finite(kind: type[AllPairs | FclTree], bad: float) -> None:
+    """A world with NaN or infinity has no pairs, and the others have theirs."""
+    lower, upper = boxes((3,), 10, 1.0)
+    expected = of_all(kind, 10).near(lower, upper)
+    lower[1], upper[1] = bad, torch.nan
+    found = of_all(kind, 10).near(lower, upper)
+    assert not bool(found[1].any())
+    assert bool((found[[0, 2]] == expected[[0, 2]]).all())
+    assert bool(expected.any())

@@ -384,3 +384,16 @@ def test_no_pairs() -> None:
     none = torch.zeros(0, dtype=torch.long)
     found = find((CUBE,), none, none, torch.zeros(0, 4, 4, dtype=F64), torch.zeros(0, 4, 4, dtype=F64))
     assert found.points.shape == (0, 8, 3)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e160, 1e308])
+def test_fcl_sees_no_absurd_places(bad: float) -> None:
+    """FCL crashes where a body is nowhere, or too far for its numbers: such rows never reach it, and the others are as without."""
+    polytopes = [polytope_of(shape) for shape in SOLIDS]
+    table, geometries = PolytopeTable.stack(polytopes), fcl_geometries(polytopes)
+    a, b, pose_a, pose_b = random_pairs(len(SOLIDS), 12, 0.4, 5)
+    expected = fcl_separation(table, geometries, a, b, pose_a, pose_b)
+    pose_a[3, 0, 3] = bad
+    found = fcl_separation(table, geometries, a, b, pose_a, pose_b)
+    for one, other in ((found.normal, expected.normal), (found.distance, expected.distance)):
+        assert torch.equal(one[torch.arange(12) != 3], other[torch.arange(12) != 3])

@@ -13,6 +13,7 @@ from pbfd_torch.cli.bench_friction import friction
 from pbfd_torch.cli.bench_hard_cases import hard_cases
 from pbfd_torch.cli.bench_precision import precision
 from pbfd_torch.cli.bench_slope import slope
+from pbfd_torch.cli.bench_soak import soak
 from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.evaluate import evaluate
 from pbfd_torch.cli.optimize import optimize
@@ -35,6 +36,7 @@ bench.command()(friction)
 bench.command()(precision)
 bench.command()(hard_cases)
 bench.command()(slope)
+bench.command()(soak)
 app.add_typer(bench, name="bench")
 app.command()(optimize)
 app.command()(view)

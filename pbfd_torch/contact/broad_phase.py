@@ -39,8 +39,8 @@ class AllPairs:
     def near(self, lower: Tensor, upper: Tensor) -> Tensor:
         """See `BroadPhase`."""
         one, other = self.first, self.second
-        apart = (lower[..., one, :] > upper[..., other, :]) | (lower[..., other, :] > upper[..., one, :])
-        return ~apart.any(-1)
+        # nothing is near what is not finite
+        return ((lower[..., one, :] <= upper[..., other, :]) & (lower[..., other, :] <= upper[..., one, :])).all(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +66,13 @@ class FclTree:
         size = np.maximum(high - low, 0.0) + _ROUNDING * np.maximum(np.abs(low), np.abs(high))
         found = np.zeros((len(low), len(self._number)), dtype=bool)
 
-        for hits, sizes, places in zip(found, size, middle, strict=True):
+        finite = np.isfinite(size).all((-2, -1)) & np.isfinite(middle).all((-2, -1))
+        for k in np.flatnonzero(finite):
+            hits, sizes, places = found[k], size[k], middle[k]
             # FCL hands out new objects in its calls: what is known of one is where it is, and colliders may share a centre
             at: dict[bytes, list[int]] = {}
-            for k, place in enumerate(places):
-                at.setdefault(place.tobytes(), []).append(k)
+            for number, place in enumerate(places):
+                at.setdefault(place.tobytes(), []).append(number)
             manager = fcl.DynamicAABBTreeCollisionManager()
             boxes = [fcl.CollisionObject(fcl.Box(*x), fcl.Transform(p)) for x, p in zip(sizes, places, strict=True)]
             manager.registerObjects(boxes)

@@ -28,6 +28,7 @@ from pbfd_torch.tensors.vectors import axis, dot, rotated
 
 _DEEPER = 0.05  # a face is taken where its depth is at most this share larger than the smallest …
 _SLACK = 1e-4  # … or its separation at most this share of the smaller body's size less than the largest
+_FARTHEST = 1e12  # [m] between bodies: beyond what worlds within their bounds hold
 _NEAR_EDGES = 4  # edges of each body next to its witness point
 
 
@@ -191,7 +192,11 @@ def _witnesses(geometries: Sequence[Any], a: Tensor, b: Tensor, rotation: Tensor
     request = fcl.DistanceRequest(enable_nearest_points=True, enable_signed_distance=True)
     turns, shifts = (plain(x).cpu().double().numpy() for x in (rotation, translation))
     points = np.zeros((len(turns), 2, 3))
+    # FCL crashes where there is no place; elsewhere it copes with what a world within its bounds may hold
+    placed = np.isfinite(turns).all((-2, -1)) & (np.abs(shifts) <= _FARTHEST).all(-1)
     for k, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
+        if not placed[k]:
+            continue
         result = fcl.DistanceResult()
         moved = fcl.CollisionObject(geometries[i], fcl.Transform(turns[k], shifts[k]))
         fcl.distance(moved, fcl.CollisionObject(geometries[j]), request, result)

@@ -21,6 +21,7 @@ from pbfd_torch.solvers.lock_step import FEWEST_LANES, solution
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.standstill import arrived
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -85,8 +86,8 @@ class AsynchronousRollout:
         self._step = torch.zeros(worlds, dtype=torch.long, device=device)
         with torch.no_grad():
             self._held = self._controlled()
-            self._objective = stepper.objective(state, self._held)
-            self._progress = self._direct.begin(self._objective, self._objective.guess, state.q)
+            begun = self._begun()
+            self._progress = self._direct.begin(self._objective, self._objective.guess, begun.q)
 
     @property
     def steps_made(self) -> Tensor:
@@ -109,6 +110,12 @@ class AsynchronousRollout:
             if len(index):
                 self._move_on(ended, index)
             return len(index)
+
+    def _begun(self) -> State:
+        """Sets the problem of every lane's present step; the state that it is made from."""
+        begun: State = self._stepper.departing(self._state, self._held)
+        self._objective = self._stepper.objective(begun, self._held)
+        return begun
 
     def _controlled(self) -> Tensor | None:
         """The control of every lane's present step; past the end, that of the last one."""
@@ -136,6 +143,8 @@ class AsynchronousRollout:
             objective = self._objective.take(index)
             advanced, found, _ = part.finished(objective, state, held, found, advanced, refused)
             self.lanes += found.lanes
+        dt = lanes.pick(self._stepper.step_size, 0)
+        advanced, found = arrived(self._stepper.articulation, integrator, state, dt, advanced, found)
         self._record(index, advanced, held, found)
         self._state = mapped(lambda old, new: old.index_copy(0, index, new), self._state, advanced)
         self._step = self._step + ended
@@ -147,12 +156,11 @@ class AsynchronousRollout:
             # a policy may look at the state of every lane; the lanes in mid-step keep the control they set out with
             fresh = self._controlled()
             self._held = fresh if fresh is None or self._held is None else torch.where(ended[:, None], fresh, self._held)
-            self._objective = self._stepper.objective(self._state, self._held)
-            self._renew(ended & (self._step < self._steps))
+            self._renew(ended & (self._step < self._steps), self._begun())
 
-    def _renew(self, where: Tensor) -> None:
+    def _renew(self, where: Tensor, begun: State) -> None:
         memory = self._direct.search.begin(self._progress.error)
-        self._progress = renewed(self._progress, where, self._objective.guess, self._state.q, memory)
+        self._progress = renewed(self._progress, where, self._objective.guess, begun.q, memory)
 
     def _record(self, index: Tensor, advanced: State, held: Tensor | None, found: Solution) -> None:
         step, world = self._step[index], self._world[index]

@@ -22,7 +22,8 @@ from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks, doubted, merged
 from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
-from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
+from pbfd_torch.stepping.standstill import arrived, departing
+from pbfd_torch.stepping.stepper import LONGEST_STEP, SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Detour, Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
@@ -39,9 +40,9 @@ Attempt = Callable[["EagerStepper[Any]", Any, Tensor | None], tuple[Any, Tensor]
 class EagerStepper(Generic[S]):
     """A `Stepper` whose every operation is one of PyTorch's.
 
-    `scene`, `integrator` (None: `EnergyMomentum`), `solver` (None: `Fallbacks`): what it is made of. `dt`: step [s] ≥ 1e-5, a
-    number or a scalar tensor; rounding would dominate the positions' differences of shorter ones. `halvings` ≥ 0: how often a
-    world's step may be halved (2, 4, 8 … shorter steps) where nothing else solves it. `evaluations` ≥ 200: what a world may spend
+    `scene`, `integrator` (None: `EnergyMomentum`), `solver` (None: `Fallbacks`): what it is made of. `dt`: step [s] from 1e-5 to
+    100, a number or a scalar tensor; rounding would dominate the positions' differences of shorter ones. `halvings` ≥ 0: how often
+    a world's step may be halved (2, 4, 8 … shorter steps) where nothing else solves it. `evaluations` ≥ 200: what a world may spend
     on a step, with all that is tried; the solver's own limit is one of each of its attempts. Raises `InputError` for a step,
     halvings or evaluations out of range.
 
@@ -57,8 +58,8 @@ class EagerStepper(Generic[S]):
         evaluations: int = MOST_EVALUATIONS,
     ) -> None:
         step = float(dt.detach()) if isinstance(dt, Tensor) else dt
-        if not (math.isfinite(step) and step >= SHORTEST_STEP):
-            raise InputError(f"dt is {step} s: must be a finite number ≥ 1e-5")
+        if not SHORTEST_STEP <= step <= LONGEST_STEP:
+            raise InputError(f"dt is {step} s: must be a number ≥ 1e-5 and ≤ {LONGEST_STEP:g}")
         if halvings < 0:
             raise InputError(f"halvings is {halvings}: must be ≥ 0")
         if evaluations < FEWEST_EVALUATIONS:
@@ -166,10 +167,21 @@ class EagerStepper(Generic[S]):
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`."""
         with torch.no_grad():
-            objective = self.objective(state, control)
-            solution = self.first_solver.solve(objective, objective.guess, state.q)
-            advanced, refusal = self.integrator.advance(objective, state, solution.q)
-            return self.finished(objective, state, control, solution, advanced, None if refusal is None else refusal())
+            start = self.departing(state, control)
+            objective = self.objective(start, control)
+            solution = self.first_solver.solve(objective, objective.guess, start.q)
+            advanced, refusal = self.integrator.advance(objective, start, solution.q)
+            refused = None if refusal is None else refusal()
+            advanced, solution, way = self.finished(objective, start, control, solution, advanced, refused)
+            return *self.arrived(state, advanced, solution), way
+
+    def departing(self, state: S, control: Tensor | None) -> S:
+        """The state with NaN for the configuration of worlds that are to stand still in its step; see `stepping.standstill`."""
+        return departing(self.articulation, self.integrator, state, self.step_size, control)
+
+    def arrived(self, state: S, advanced: S, solution: Solution) -> tuple[S, Solution]:
+        """The end of the step from a state, with worlds that got lost back in that state; see `stepping.standstill`."""
+        return arrived(self.articulation, self.integrator, state, self.step_size, advanced, solution)
 
     def finished(
         self,

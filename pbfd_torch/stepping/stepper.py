@@ -18,7 +18,7 @@ from pbfd_torch.solvers.objective import Relaxable, Solution
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.worlds import Worlds
 
-SHORTEST_STEP = 1e-5  # [s]
+SHORTEST_STEP, LONGEST_STEP = 1e-5, 100.0  # [s]
 
 
 class Solver(Protocol):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.facts import known
@@ -45,6 +46,26 @@ class Worlds:
     def rows(self, value: Tensor) -> Tensor:
         """Rows `[n, *event]` of a value `[*batch, *event]` that has all the batch's dimensions."""
         return self.pick(value, value.ndim - len(self.batch))
+
+
+@dataclass(frozen=True, eq=False)
+class Census(Worlds):
+    """Takes no worlds of anything, and notes what it is shown: tensors, and how many of their last dimensions are their own."""
+
+    batch: tuple[int, ...] = ()
+    index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
+    shown: list[tuple[Tensor, int]] = field(default_factory=list)
+
+    def pick(self, value: Any, rank: int) -> Any:
+        """The value itself."""
+        if isinstance(value, Tensor):
+            self.shown.append((value, min(rank, value.ndim)))
+        return value
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """For how many worlds there are values."""
+        return [tuple(value.shape[: value.ndim - rank]) for value, rank in self.shown]
 
 
 def replaced(instance: Instance, **changes: Any) -> Instance:

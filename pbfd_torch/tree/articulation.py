@@ -21,6 +21,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.bounds import HEAVIEST, LIGHTEST, MASSES
 from pbfd_torch.tree.rotations import quaternion_matrix, skew
 from pbfd_torch.tree.topology import Topology
 
@@ -163,8 +164,8 @@ class Articulation:
                 raise InputError(f"{name} has shape {tuple(value.shape)}: must end in {shape}")
             if value.dtype != self.rest.dtype or value.device != self.rest.device:
                 raise InputError(f"{name} is {value.dtype} on {value.device}: must be {self.rest.dtype} on {self.rest.device}")
-            if bool(torch.isnan(value).any()):
-                raise InputError(f"{name} holds NaN")
+            if bool((torch.isnan(value) if name in ("lower", "upper") else ~torch.isfinite(value)).any()):
+                raise InputError(f"{name} holds NaN or infinity: must be finite, but for limits that do not limit")
         self._check_inertia()
         self.joint_basis()  # kept from now on: nothing of a step, which a device may record and repeat, makes it for later ones
 
@@ -182,6 +183,8 @@ class Articulation:
             for k, name in enumerate(self.topology.link_names):
                 if not bool((mass[..., k] >= 0).all()):
                     raise ModelError(f"mass is {float(mass[..., k].min())} kg: must be ≥ 0", element=f"link '{name}'")
+                if len(odd := mass[..., k][(mass[..., k] > 0) & ((mass[..., k] < LIGHTEST) | (mass[..., k] > HEAVIEST))]):
+                    raise ModelError(f"mass is {float(odd[0]):g} kg: must be 0, or {MASSES}", element=f"link '{name}'")
                 if not bool((least[..., k] >= -slack * size[..., k]).all()):
                     raise ModelError(
                         f"inertia is not positive semi-definite: smallest principal moment {float(least[..., k].min()):.3g} kg m²",
