@@ -12,18 +12,18 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import check_folder, environment, new_table, plain, write_files
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
 from pbfd_torch.cli.options import use_threads
-from pbfd_torch.errors import InputError
+from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.cli.ranges import MEASURED_STEP, SOAKED, SOAKED_SEED
 
 FILES = ("soak.json",)
-MOST_WORLD_STEPS = 10**9
 
 
 def soak(
-    world_steps: Annotated[int, typer.Option(help="Steps of single worlds to make, at least.")] = 200_000,
-    seed: Annotated[int, typer.Option(help="Seed of the first robot; the next ones follow.")] = 0,
-    dt: Annotated[float, typer.Option(help="Time step in seconds.")] = 0.01,
+    world_steps: Annotated[int, SOAKED.option("Steps of single worlds to make, at least.")] = 200_000,
+    seed: Annotated[int, SOAKED_SEED.option("Seed of the first robot; the next ones follow.")] = 0,
+    dt: Annotated[float, MEASURED_STEP.option("Time step in seconds.")] = 0.01,
     out: Annotated[Path, typer.Option(help=f"Folder for {FILES[0]}.")] = Path("bench-soak"),
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
@@ -31,10 +31,6 @@ def soak(
     states that are not finite, energy beyond the integrator's account, steps over their budget, memory that grows. One thread,
     float64.
     Exit status 1: a state was not finite and no status said so, or a step was over its budget."""
-    if not 1 <= world_steps <= MOST_WORLD_STEPS:
-        raise InputError(f"--world-steps is {world_steps}: must be from 1 to {MOST_WORLD_STEPS}")
-    if not 0 <= seed < 2**62:
-        raise InputError(f"--seed is {seed}: must be from 0 to 2⁶² − 1")
     check_folder(out, FILES)
     use_threads(1)
     report = measured(world_steps, seed, dt)

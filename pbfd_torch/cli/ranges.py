@@ -10,7 +10,7 @@ import typer
 
 from pbfd_torch import memory
 from pbfd_torch.errors import InputError
-from pbfd_torch.stepping.stepper import SHORTEST_STEP
+from pbfd_torch.stepping.stepper import LONGEST_STEP, SHORTEST_STEP
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def _text(value: float) -> str:
 
 
 WORLDS = WorldsRange()
-STEP = Range(SHORTEST_STEP, 1e9, "s")
+STEP = Range(SHORTEST_STEP, LONGEST_STEP, "s")
 DURATION = Range(SHORTEST_STEP, 1e9, "s")
 ACCURACY = Range(1e-9, 1.0, "m")
 CONTROL_STEP = Range(SHORTEST_STEP, 1.0, "s")
@@ -84,3 +84,5 @@ MEASURED_WORLDS = Range(1, 4096)
 MEASURED_SECONDS = Range(1e-3, 1e5, "s")
 REPEATS = Range(1, 1000)
 TRAJECTORY = Range(0.1, 60, "s")
+SOAKED = Range(1, 10**9)
+SOAKED_SEED = Range(0, 2**62)
