@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pbfd_torch.viewer
-from pbfd_torch.cli import bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_solvers, optimize, simulate
+from pbfd_torch.cli import bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers, optimize, simulate
 from pbfd_torch.errors import InputError
 from pbfd_torch.learning.ppo import PpoTrainer
 from pbfd_torch.learning.shac import ShacTrainer
@@ -72,6 +72,7 @@ COMMANDS: dict[tuple[str, ...], tuple[list[str], dict[str, list[str]]]] = {
     ("bench", "precision"): ([], BENCH | {"--scenes": ["stack"], "--integrators": ["bdf2"]}),
     ("bench", "hard-cases"): ([], BENCH | {"--cases": ["free-fall"], "--integrators": ["bdf2"], "--dt": ["0.01"]}),
     ("bench", "slope"): ([], BENCH | {"--duration": ["1"]}),
+    ("bench", "soak"): ([], BENCH | {"--world-steps": ["10"], "--seed": ["3"], "--dt": ["0.01"]}),
 }
 
 
@@ -126,7 +127,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.chdir(folder)
         patch.setattr(simulate, "MAX_STEPS", 10)
         patch.setattr(optimize, "run", _not_measured)
-        for bench in (bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_solvers):
+        for bench in (bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers):
             patch.setattr(bench, "measured", _not_measured)
         for trainer in (PpoTrainer, ShacTrainer):
             patch.setattr(trainer, "__init__", _not_measured)
