@@ -130,6 +130,8 @@ class Experiment:
             else:
                 size = value.abs().clamp_min(1e-3)
                 found[name] = size * noise if value.ndim else 0.3 * size
+                if last == "torque":  # none may be negative: what is zero stays so
+                    found[name] = torch.where(value == 0, 0.0, found[name])
             if name.startswith("terms") and shape == tuple(value.shape) == (
                 self.scene.articulation.nv,
             ):  # one number for all axes of a rotation

@@ -29,5 +29,10 @@ def require_positive(what: str, value: float | Tensor, unit: str = "") -> None:
 
 def _require(what: str, value: float | Tensor, unit: str, fits: Callable[[Tensor], Tensor], where: str) -> None:
     entries = torch.as_tensor(value)
-    if not bool((torch.isfinite(entries) & fits(entries)).all()):
-        raise InputError(f"{what} is {entries.tolist()}{unit and ' ' + unit}: must be {where} and finite")
+    good = torch.isfinite(entries) & fits(entries)
+    if bool(good.all()):
+        return
+    wrong = entries[~good]
+    shown = ", ".join(f"{x:g}" for x in wrong[:3].tolist())
+    more = f" and {len(wrong) - 3} more entries" if len(wrong) > 3 else ""
+    raise InputError(f"{what} is {shown}{unit and ' ' + unit}{more}: must be {where} and finite")

@@ -15,7 +15,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pbfd_torch.viewer
-from pbfd_torch.cli import bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers, optimize, simulate
+from pbfd_torch.cli import (
+    bench_friction,
+    bench_hard_cases,
+    bench_precision,
+    bench_slope,
+    bench_soak,
+    bench_solvers,
+    optimize,
+    simulate,
+)
 from pbfd_torch.errors import InputError
 from pbfd_torch.learning.ppo import PpoTrainer
 from pbfd_torch.learning.shac import ShacTrainer
