@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.solvers.directions import Direction, Newton
 from pbfd_torch.solvers.lock_step import lock_step
-from pbfd_torch.solvers.objective import Objective, Solution, Status
+from pbfd_torch.solvers.objective import Objective, Sane, Solution, Status
 from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.solvers.progress import AT_GUESS, AT_RETREAT, SEARCHING, Progress, Sighting
 from pbfd_torch.solvers.searches import Memory, Search, Trial, WorkSearch
@@ -84,8 +84,10 @@ class Descent:
         good = finite & (error <= self.retreat_above)
         refuge = torch.isfinite(p.retreat).all(-1)
         retreating = p.running & (p.stage == AT_GUESS) & ~good & refuge
-        lost = p.running & ((p.stage == AT_RETREAT) | ((p.stage == AT_GUESS) & ~refuge)) & ~finite
-        usable = p.running & finite & ~retreating
+        last = (p.stage == AT_RETREAT) | ((p.stage == AT_GUESS) & ~refuge)
+        hopeless = ~finite | objective.absurd(evaluation) if isinstance(objective, Sane) else ~finite
+        lost = p.running & last & hopeless
+        usable = p.running & finite & ~retreating & ~lost
         arrived = usable & (error <= self.tolerance_for(p.q.dtype))
         status = torch.where(arrived, int(Status.SOLVED), p.status)
         ended = dataclasses.replace(

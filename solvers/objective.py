@@ -99,6 +99,15 @@ class Foreseeing(Protocol):
         ...
 
 
+@runtime_checkable
+class Sane(Protocol):
+    """An objective that knows what is not worth a search."""
+
+    def absurd(self, evaluation: Any) -> Tensor:
+        """Worlds to be given up if they are like this where their last guess is evaluated, `[*batch]` bool."""
+        ...
+
+
 class Relaxable(Objective, Protocol):
     """An objective that knows easier problems close to it, for the fallbacks."""
 

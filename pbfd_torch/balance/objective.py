@@ -39,7 +39,7 @@ from pbfd_torch.tree.kinematics import Placement, difference, place, retract
 
 NEGLIGIBLE = 0.1  # of the scale, at most, may be left to rounding
 FARTHEST = 0.5 * math.pi  # [rad] that contacts may turn a joint by in a step
-ABSURD = 1e6  # what is left unbalanced in a step may move the bodies by so many times their extent, or [rad]
+ABSURD = 1e6  # what is unbalanced where a step begins may move the bodies by so many times their extent, or [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +95,7 @@ class BalanceObjective:
 
     def error(self, evaluation: Evaluation, tolerance: float) -> Tensor:
         """‖r / (scale + rounding/tolerance)‖₂ `[*batch]`; the rounding is that of inertia and, for worlds that are not solved with
-        it, of what the Jacobian makes of coordinates that are rounded themselves: stiff friction feels a displacement of ε|x|.
-        Infinite where the forces are absurd: those are not to be balanced, and no search shall try."""
+        it, of what the Jacobian makes of coordinates that are rounded themselves: stiff friction feels a displacement of ε|x|."""
         whole = weighted_error(evaluation.residual, self.scale, torch.zeros_like(self.rounding), tolerance)
         least = tolerance / NEGLIGIBLE * whole
         strict = torch.maximum(weighted_error(evaluation.residual, self.scale, self.rounding, tolerance), least)
@@ -104,13 +103,17 @@ class BalanceObjective:
         # what is in the host's own memory it may look at; asking a device would make it wait
         if strict.device.type == "cpu" and bool((solved | ~torch.isfinite(strict)).numpy().all()):
             return strict
-        # the rounding is that of κ m x
-        moved = evaluation.residual.abs() / self.rounding * (8 * torch.finfo(self.rounding.dtype).eps)
-        strict = torch.where(moved.amax(-1) > ABSURD, torch.inf, strict)
         epsilon = 2 * torch.finfo(self.scale.dtype).eps
         felt = (evaluation.jacobian.abs() * self.extent[..., None, :]).sum(-1)
         lenient = weighted_error(evaluation.residual, self.scale, self.rounding + epsilon * felt, tolerance)
-        return torch.where(solved | torch.isinf(strict), strict, torch.maximum(lenient, least))
+        return torch.where(solved, strict, torch.maximum(lenient, least))
+
+    def absurd(self, evaluation: Evaluation) -> Tensor:
+        """Where the forces are not to be balanced, and no search shall try: what is unbalanced would move the bodies by more than
+        `ABSURD` times their extent, `[*batch]` bool."""
+        # the rounding is that of κ m x
+        moved = evaluation.residual.abs() / self.rounding * (8 * torch.finfo(self.rounding.dtype).eps)
+        return moved.amax(-1) > ABSURD
 
     def retract(self, q: Tensor, step: Tensor) -> Tensor:
         """q moved by the tangent vector `step`."""
