@@ -1,0 +1,232 @@
+// The state after an energy–momentum step, and what it has gained beyond the forces' work, as integrators/energy_momentum.py.
+#pragma once
+#include "newton.h"
+
+namespace pbfd {
+
+constexpr double FLATTEST = 0.3, FARTHEST = 2.0, EXCESS = 1e-2, NOISE = 1e-4, RESERVE = 1e-2;
+
+// Attributes as of `Velocities`, [nv] each but for the three energies.
+template <class V> struct Velocities {
+  V *v, *push, *steady, *lag, *average;
+  V gained, surplus, peak;
+  static Velocities in(Arena<V>& arena, Sizes s) {
+    Velocities x;
+    x.v = arena.take(s.nv), x.push = arena.take(s.nv), x.steady = arena.take(s.nv);
+    x.lag = arena.take(s.nv), x.average = arena.take(s.nv), x.gained = x.surplus = x.peak = V(0);
+    return x;
+  }
+};
+
+template <class V, class N> struct EnergyMomentum {
+  using M = typename Kind<V>::Mask;
+  const Plan<N>& plan;
+  V surplus_allowed;
+  V *twist, *rates, *momentum, *impulse, *smooth, *rough, *other, *matrix, *total;
+  Pull<V>* sums;
+
+  static int room(Sizes s) {
+    return s.nodes * (6 + 12 + int(sizeof(Pull<V>) / sizeof(V))) + 6 * s.nv + s.nv * s.nv;
+  }
+  EnergyMomentum(const Plan<N>& scene, Arena<V>& arena) : plan(scene), surplus_allowed(1e-3) {
+    twist = arena.take(6 * plan.nodes), rates = arena.take(12 * plan.nodes);
+    momentum = arena.take(plan.nv), impulse = arena.take(plan.nv), smooth = arena.take(plan.nv), rough = arena.take(plan.nv);
+    other = arena.take(plan.nv), total = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
+    sums = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
+  }
+
+  // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it.
+  M advance(Balance<V, N>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
+    const int n = plan.nv;
+    const V h = b.dt, zero(0), half(0.5);
+    split_forces(b, q);
+    difference(plan, b.q_start, q, after.average);
+    for (int i = 0; i < n; i++) after.average[i] = after.average[i] / h;
+
+    // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions
+    motion_axes(plan, b.start, b.chord_axes);
+    move(b.start, b.chord_axes, before.v);
+    for (int k = 0; k < plan.nodes; k++) {
+      const V* rate = rates + 12 * k;
+      V next[12];
+      for (int i = 0; i < 9; i++)
+        next[i] = fma(V(2), (b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i]) / h, -rate[i]);
+      for (int i = 0; i < 3; i++)
+        next[9 + i] = fma(V(2), (b.now.position[3 * k + i] - b.start.position[3 * k + i]) / h, -rate[9 + i]);
+      pushed(k, b.now, next, sums[k]);
+    }
+    sum_up();
+    for (int i = 0; i < n; i++) {
+      impulse[i] = h * rough[i];
+      momentum[i] = V(plan.armature[i]) * fma(V(2), after.average[i], -before.v[i]);
+    }
+    each_freedom([&](int k, int i) { momentum[i] += worked(b.axes + 6 * i, sums[k].moment, sums[k].force); });
+    for (int i = 0; i < n; i++) momentum[i] -= h * fma(ahead(i), smooth[i], rough[i]);
+
+    masses(b);
+    for (int i = 0; i < n; i++) {
+      V row(0);
+      for (int j = 0; j < n; j++) row = fma(matrix[i * n + j], before.v[j], row);
+      other[i] = momentum[i] - row - h * smooth[i];
+      after.v[i] = momentum[i], after.push[i] = impulse[i];
+    }
+    factor();
+    resolve(after.v), resolve(after.push);
+    V kept(0), whole(0);
+    for (int i = 0; i < n; i++) kept = fma(impulse[i], before.push[i], kept), whole = fma(impulse[i], after.push[i], whole);
+    const V share = clamped(kept / select(whole > zero, whole, V(1)), zero, V(1));
+    for (int i = 0; i < n; i++) {
+      after.lag[i] = -ahead(i) * (other[i] - (V(1) - share) * impulse[i]);
+      after.steady[i] = share * after.push[i];
+    }
+    resolve(after.lag);
+
+    for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
+    const V first = kinetic(b.start, b.chord_axes, total);
+    for (int i = 0; i < n; i++) total[i] = fma(half, after.steady[i], after.v[i]);
+    const V last = kinetic(b.now, b.axes, total);
+    V work(0), spurious(0), turned(0);
+    for (int i = 0; i < n; i++) {
+      work = fma(h * (rough[i] + smooth[i]), after.average[i], work);
+      spurious = fma(h * b.residual[i], after.average[i], spurious);
+      turned = max(turned, abs(h * after.average[i]) * V(plan.turns[i]));
+    }
+    V mass(0), lost(0), flattest(1);
+    for (int k = 0; k < plan.nodes; k++) {
+      V x[3], x0[3];
+      times(b.now.rotation + 9 * k, plan.center + 3 * k, x), times(b.start.rotation + 9 * k, plan.center + 3 * k, x0);
+      mass += V(plan.mass[k]);
+      for (int i = 0; i < 3; i++) {
+        const V fell = (x[i] + b.now.position[3 * k + i]) - (x0[i] + b.start.position[3 * k + i]);
+        lost = fma(V(plan.mass[k]) * V(plan.gravity[i]), fell, lost);
+      }
+      V middle[9];
+      for (int i = 0; i < 9; i++) middle[i] = half * (b.now.rotation[9 * k + i] + b.start.rotation[9 * k + i]);
+      flattest = min(flattest, determinant(middle));
+    }
+    const V g[3] = {V(plan.gravity[0]), V(plan.gravity[1]), V(plan.gravity[2])};
+    const V strength = max(sqrt(dot(g, g)), V(1)), falls = half * mass * (h * strength) * (h * strength);
+    after.gained = last - first - lost - work;
+    after.peak = max(before.peak, max(first, last) + falls);
+    after.surplus = max(before.surplus + after.gained, V(-RESERVE) * after.peak);
+    const V whole_energy = first + last + falls;
+    const V gained = after.gained - spurious, surplus = after.surplus - spurious;
+    const M excess = (after.gained > V(EXCESS) * whole_energy) & (gained > V(EXCESS) * whole_energy);
+    const M overdrawn = (after.surplus > surplus_allowed * after.peak) & (after.gained > V(NOISE) * after.peak) &
+                        (surplus > surplus_allowed * after.peak) & (gained > V(NOISE) * after.peak);
+    return (flattest < V(FLATTEST)) | (turned > V(FARTHEST)) | excess | overdrawn;
+  }
+
+ private:
+  V ahead(int i) const { return fma(V(2), V(plan.share[i]), V(-1)); }
+
+  template <class F> void each_freedom(F&& visit) const {
+    for (int k = 0; k < plan.nodes; k++)
+      for (int i = plan.v[k]; i < plan.v[k] + freedoms(plan.kind[k]); i++) visit(k, i);
+  }
+  static V worked(const V* s, const V* moment, const V* force) {
+    const V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
+    return dot(s, torque) + dot(s + 3, force);
+  }
+  static V determinant(const V* M) {
+    V c[3];
+    cross(M + 3, M + 6, c);
+    return dot(M, c);
+  }
+
+  // Generalised forces of contacts, limits and dry friction, and of what is `Fitted`, as if taken whole.
+  void split_forces(const Balance<V, N>& b, const V* q) {
+    const JointStep<V> step{b.q_start, b.q_target, b.control, b.dt, b.weight};
+    for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = V(0);
+    joint_loads<SMOOTH>(plan, step, q, smooth, static_cast<V*>(nullptr));
+    joint_loads<ROUGH>(plan, step, q, rough, static_cast<V*>(nullptr));
+    each_freedom([&](int k, int i) {
+      if (b.pushes[k].any) rough[i] += worked(b.axes + 6 * i, b.pushes[k].moment, b.pushes[k].force);
+    });
+    for (int i = 0; i < plan.nv; i++) smooth[i] = -smooth[i] / V(plan.share[i]), rough[i] = -rough[i];
+  }
+
+  // How fast all poses change that move with v: Ṫ = [V] T.
+  void move(Poses<V> at, const V* axes, const V* v) {
+    twists(plan, axes, v, twist);
+    for (int k = 0; k < plan.nodes; k++) {
+      const V *w = twist + 6 * k, *R = at.rotation + 9 * k;
+      V* out = rates + 12 * k;
+      for (int j = 0; j < 3; j++) {
+        const V c[3] = {R[j], R[3 + j], R[6 + j]};
+        V moved[3];
+        cross(w, c, moved);
+        for (int i = 0; i < 3; i++) out[3 * i + j] = moved[i];
+      }
+      cross(w, at.position + 3 * k, out + 9);
+      for (int i = 0; i < 3; i++) out[9 + i] += w[3 + i];
+    }
+  }
+
+  // The moment of the momenta of a node whose pose changes at `rate`.
+  void pushed(int k, Poses<V> at, const V* rate, Pull<V>& out) const {
+    const N *center = plan.center + 3 * k, *second = plan.second + 9 * k;
+    const V *R = at.rotation + 9 * k, mass = V(plan.mass[k]);
+    V spread[9], x[3], speed[3];
+    product(rate, second, spread);
+    product_transposed(spread, R, out.moment);
+    times(R, center, x), times(rate, center, speed);
+    for (int i = 0; i < 3; i++) x[i] += at.position[3 * k + i], out.force[i] = mass * (speed[i] + rate[9 + i]);
+    for (int i = 0; i < 3; i++)
+      for (int j = 0; j < 3; j++) out.moment[3 * i + j] = fma(out.force[i], x[j], out.moment[3 * i + j]);
+    // beside it, what the mass matrix needs
+    product(R, second, spread);
+    product_transposed(spread, R, out.second);
+    out.mass = mass;
+    for (int i = 0; i < 3; i++) out.first[i] = out.on_chord[i] = mass * x[i];
+    for (int i = 0; i < 3; i++)
+      for (int j = 0; j < 3; j++) out.second[3 * i + j] = fma(out.first[i], x[j], out.second[3 * i + j]);
+    for (V& y : out.at_end) y = V(0);
+  }
+  void sum_up() {
+    for (int k = plan.nodes - 1; k > 0; k--)
+      if (plan.parent[k] >= 0) sums[plan.parent[k]].add(sums[k]);
+  }
+
+  V kinetic(Poses<V> at, const V* axes, const V* v) {
+    move(at, axes, v);
+    V twice(0);
+    for (int k = 0; k < plan.nodes; k++) {
+      const V* rate = rates + 12 * k;
+      V spread[9], speed[3];
+      product(rate, plan.second + 9 * k, spread);
+      for (int i = 0; i < 9; i++) twice = fma(spread[i], rate[i], twice);
+      times(rate, plan.center + 3 * k, speed);
+      for (int i = 0; i < 3; i++) speed[i] += rate[9 + i];
+      twice = fma(V(plan.mass[k]), dot(speed, speed), twice);
+    }
+    for (int i = 0; i < plan.nv; i++) twice = fma(V(plan.armature[i]) * v[i], v[i], twice);
+    return V(0.5) * twice;
+  }
+
+  // M [nv × nv] at the end of the step.
+  void masses(const Balance<V, N>& b) {
+    const int n = plan.nv;
+    for (int i = 0; i < n * n; i++) matrix[i] = V(0);
+    each_freedom([&](int k, int j) {
+      const Pull<V>& p = sums[k];
+      const V *s = b.axes + 6 * j, sum = trace(p.second);
+      V below[6];
+      times(p.second, s, below);
+      for (int i = 0; i < 3; i++) below[i] = fma(sum, s[i], -below[i]), below[3 + i] = p.mass * s[3 + i];
+      add_cross(p.first, s + 3, below);
+      add_cross(s, p.first, below + 3);
+      for (int up = k; up >= 0; up = plan.parent[up])
+        for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++) {
+          const V* t = b.axes + 6 * i;
+          matrix[i * n + j] = matrix[j * n + i] = dot(t, below) + dot(t + 3, below + 3);
+        }
+      matrix[j * n + j] += V(plan.armature[j]);
+    });
+  }
+
+  void factor() { factor_along_the_tree(plan, matrix); }
+  void resolve(V* x) const { substitute_along_the_tree(plan, matrix, x); }
+};
+
+}  // namespace pbfd

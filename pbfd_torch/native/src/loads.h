@@ -1,0 +1,51 @@
+// What acts on the nodes, summed up about the world's origin, and its sums over all that a joint moves.
+//
+// Forces f at points p make the moment [G | g] = −Σ f [pᵀ | 1] (METHOD §3). How they answer a twist (ω, v) of their node, with the
+// axes held still: inertia by second moments, contacts by a matrix [6 × 6].
+#pragma once
+#include "tree.h"
+
+namespace pbfd {
+
+// Inertial loads of a node. Their work is done on the chord of the step, or at its end: then both are one.
+template <class V> struct Pull {
+  V moment[9], force[3];  // [G | g] of points on the chord
+  V at_end[9];            // G of the points at the step's end
+  V second[9];            // Σ m p p̄ᵀ, p at the end, p̄ on the chord
+  V first[3], on_chord[3], mass;  // Σ m p, Σ m p̄, Σ m
+
+  void clear() {
+    for (V& x : moment) x = V(0);
+    for (V& x : at_end) x = V(0);
+    for (V& x : second) x = V(0);
+    for (int i = 0; i < 3; i++) force[i] = first[i] = on_chord[i] = V(0);
+    mass = V(0);
+  }
+  void add(const Pull& o) {
+    for (int i = 0; i < 9; i++) moment[i] += o.moment[i], at_end[i] += o.at_end[i], second[i] += o.second[i];
+    for (int i = 0; i < 3; i++) force[i] += o.force[i], first[i] += o.first[i], on_chord[i] += o.on_chord[i];
+    mass += o.mass;
+  }
+};
+
+// Contact loads of a node.
+template <class V> struct Push {
+  V moment[9], force[3];
+  V stiffness[36];
+  bool any;  // in some lane
+
+  void clear() {
+    for (V& x : moment) x = V(0);
+    for (V& x : force) x = V(0);
+    for (V& x : stiffness) x = V(0);
+    any = false;
+  }
+  void add(const Push& o) {
+    for (int i = 0; i < 9; i++) moment[i] += o.moment[i];
+    for (int i = 0; i < 3; i++) force[i] += o.force[i];
+    for (int i = 0; i < 36; i++) stiffness[i] += o.stiffness[i];
+    any = true;
+  }
+};
+
+}  // namespace pbfd

@@ -1,0 +1,80 @@
+// A ball is dropped, in a register of worlds and in worlds by themselves: it comes to rest on the ground, and both agree to the bit.
+#include "library.cpp"
+
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+#include "check.h"
+
+namespace {
+
+constexpr double RADIUS = 0.1, MASS = 1.0, G = 9.81, DT = 0.01;
+constexpr int NQ = 7, NV = 6, WORLDS = 11, STEPS = 100;
+
+const int whole[] = {-1, FREE, 0, 0, 0};
+
+std::vector<double> numbers() {
+  const double inf = std::numeric_limits<double>::infinity(), second = MASS * RADIUS * RADIUS / 5;
+  std::vector<double> n = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, MASS, 0, 0, 0, second, 0, 0, 0, second, 0, 0, 0, second};
+  auto each = [&](double straight, double turning) {
+    for (int i = 0; i < NV; i++) n.push_back(i < 3 ? straight : turning);
+  };
+  each(MASS * G, MASS * G * RADIUS), each(MASS, MASS * RADIUS), each(0, 1), each(0.5, 0.5);
+  for (int what = 0; what < 4; what++) each(0, 0);  // no springs, damping, rotors, dry friction
+  each(-inf, -inf), each(inf, inf), each(0, 0);
+  n.insert(n.end(), {0, 0, 0, 1, 0, 0, 0});
+  n.insert(n.end(), {0, 0, 0, RADIUS, 0, MASS * G / 1e-6, 0.5, 0, 0, 1, 0, 0.01});
+  n.insert(n.end(), {0, 0, -G, RADIUS, 0.1, 1e-3, 1, 1e-3});
+  return n;
+}
+
+struct Worlds {
+  std::vector<std::vector<double>> given, found;
+  std::vector<int> counted[5];
+
+  explicit Worlds(int count) {
+    for (int size : {NQ, NV, NV, NV, NV, NV, 1, 1, 1, 0}) given.emplace_back(size * count + 1, 0.0);
+    for (int size : {NQ, NV, NV, NV, NV, NV, 1, 1, 1, 1}) found.emplace_back(size * count + 1, 0.0);
+    for (auto& x : counted) x.resize(count);
+  }
+};
+
+// Worlds `first` … of all, each dropped from its own height and set spinning.
+Worlds dropped(int first, int count) {
+  const std::vector<double> real = numbers();
+  const pbfd_plan plan{8, 1, NQ, NV, 0, 1, whole, real.data()};
+  CHECK(pbfd_whole_numbers(&plan) == 5);
+  CHECK(pbfd_real_numbers(&plan) == long(real.size()));
+  void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);
+  Worlds worlds(count);
+  for (int w = 0; w < count; w++) {
+    worlds.given[0][2 * count + w] = RADIUS + 0.01 * (first + w), worlds.given[0][3 * count + w] = 1;
+    worlds.given[1][4 * count + w] = first + w;
+  }
+  for (int step = 0; step < STEPS; step++) {
+    pbfd_step s{DT, 1e-9, 1e-3, 40, count, 0, count, {}, {}, {}};
+    for (int i = 0; i < 10; i++) s.given[i] = worlds.given[i].data(), s.found[i] = worlds.found[i].data();
+    for (int i = 0; i < 5; i++) s.counted[i] = worlds.counted[i].data();
+    pbfd_energy_momentum(&plan, &s, room);
+    for (int i = 0; i < 9; i++) worlds.given[i] = worlds.found[i];
+  }
+  std::free(room);
+  return worlds;
+}
+
+}  // namespace
+
+int main() {
+  const Worlds all = dropped(0, WORLDS);
+  for (int w = 0; w < WORLDS; w++) {
+    CHECK(all.counted[0][w] == SOLVED);
+    CHECK(std::fabs(all.given[0][2 * WORLDS + w] - RADIUS) < 2e-3);
+    const Worlds alone = dropped(w, 1);
+    for (int i = 0; i < NQ; i++) CHECK(alone.given[0][i] == all.given[0][i * WORLDS + w]);
+    for (int i = 0; i < NV; i++) CHECK(alone.given[1][i] == all.given[1][i * WORLDS + w]);
+  }
+  return failures();
+}
