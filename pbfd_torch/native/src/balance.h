@@ -125,12 +125,6 @@ template <class V, class N> struct Balance {
   const V* inertial_axis(int j) const { return (on_chord ? chord_axes : axes) + 6 * j; }
   static V along(const V* a, const V* b) { return dot(a, b) + dot(a + 3, b + 3); }
 
-  // ω · (Σ p × f) + v · Σ f, of minus the forces.
-  static V worked(const V* s, const V* moment, const V* force) {
-    const V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
-    return dot(s, torque) + dot(s + 3, force);
-  }
-
   // A s, or (A + w B) s where the points move on the chord.
   void answer(const Pull<V>& p, const V* s, bool moved, V* out) const {
     const V *w = s, *v = s + 3, sum = trace(p.second);

@@ -45,7 +45,7 @@ template <class V, class N> struct EnergyMomentum {
 
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions
     motion_axes(plan, b.start, b.chord_axes);
-    move(b.start, b.chord_axes, before.v);
+    pose_rates(plan, b.start, b.chord_axes, before.v, twist, rates);
     for (int k = 0; k < plan.nodes; k++) {
       const V* rate = rates + 12 * k;
       V next[12];
@@ -124,10 +124,6 @@ template <class V, class N> struct EnergyMomentum {
     for (int k = 0; k < plan.nodes; k++)
       for (int i = plan.v[k]; i < plan.v[k] + freedoms(plan.kind[k]); i++) visit(k, i);
   }
-  static V worked(const V* s, const V* moment, const V* force) {
-    const V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
-    return dot(s, torque) + dot(s + 3, force);
-  }
   static V determinant(const V* M) {
     V c[3];
     cross(M + 3, M + 6, c);
@@ -144,23 +140,6 @@ template <class V, class N> struct EnergyMomentum {
       if (b.pushes[k].any) rough[i] += worked(b.axes + 6 * i, b.pushes[k].moment, b.pushes[k].force);
     });
     for (int i = 0; i < plan.nv; i++) smooth[i] = -smooth[i] / V(plan.share[i]), rough[i] = -rough[i];
-  }
-
-  // How fast all poses change that move with v: Ṫ = [V] T.
-  void move(Poses<V> at, const V* axes, const V* v) {
-    twists(plan, axes, v, twist);
-    for (int k = 0; k < plan.nodes; k++) {
-      const V *w = twist + 6 * k, *R = at.rotation + 9 * k;
-      V* out = rates + 12 * k;
-      for (int j = 0; j < 3; j++) {
-        const V c[3] = {R[j], R[3 + j], R[6 + j]};
-        V moved[3];
-        cross(w, c, moved);
-        for (int i = 0; i < 3; i++) out[3 * i + j] = moved[i];
-      }
-      cross(w, at.position + 3 * k, out + 9);
-      for (int i = 0; i < 3; i++) out[9 + i] += w[3 + i];
-    }
   }
 
   // The moment of the momenta of a node whose pose changes at `rate`.
@@ -189,7 +168,7 @@ template <class V, class N> struct EnergyMomentum {
   }
 
   V kinetic(Poses<V> at, const V* axes, const V* v) {
-    move(at, axes, v);
+    pose_rates(plan, at, axes, v, twist, rates);
     V twice(0);
     for (int k = 0; k < plan.nodes; k++) {
       const V* rate = rates + 12 * k;

@@ -13,27 +13,36 @@ template <class V, class N> inline void twists(const Plan<N>& plan, const V* axe
   }
 }
 
-// T̂ = T_n + Δt V_n + a [0 | g]: poses moved along the velocity v, and fallen.
-template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall, V* room) {
-  const Plan<N>& plan = b.plan;
-  twists(plan, b.axes, v, room);
-  for (int k = 0; k < plan.nodes; k++) {
-    const V *w = room + 6 * k, *R = b.start.rotation + 9 * k, *p = b.start.position + 3 * k;
+// How fast all poses change that move with v [nv]: Ṫ = [V] T, rotation [9] and position [3] each. twist: room, [6] each.
+template <class V, class N> inline void pose_rates(const Plan<N>& plan, Poses<V> at, const V* axes, const V* v, V* twist, V* out) {
+  twists(plan, axes, v, twist);
+  for (int k = 0; k < plan.nodes; k++, out += 12) {
+    const V *w = twist + 6 * k, *R = at.rotation + 9 * k;
     for (int j = 0; j < 3; j++) {
       const V column[3] = {R[j], R[3 + j], R[6 + j]};
       V moved[3];
       cross(w, column, moved);
-      for (int i = 0; i < 3; i++) b.target.rotation[9 * k + 3 * i + j] = fma(b.dt, moved[i], column[i]);
+      for (int i = 0; i < 3; i++) out[3 * i + j] = moved[i];
     }
-    V moved[3];
-    cross(w, p, moved);
+    cross(w, at.position + 3 * k, out + 9);
+    for (int i = 0; i < 3; i++) out[9 + i] += w[3 + i];
+  }
+}
+
+// T̂ = T_n + Δt V_n + a [0 | g]: poses moved along the velocity v, and fallen. room: [18] per node.
+template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall, V* room) {
+  const Plan<N>& plan = b.plan;
+  const V* rate = room + 6 * plan.nodes;
+  pose_rates(plan, b.start, b.axes, v, room, room + 6 * plan.nodes);
+  for (int k = 0; k < plan.nodes; k++, rate += 12) {
+    for (int i = 0; i < 9; i++) b.target.rotation[9 * k + i] = fma(b.dt, rate[i], b.start.rotation[9 * k + i]);
     for (int i = 0; i < 3; i++)
-      b.target.position[3 * k + i] = fma(fall, V(plan.gravity[i]), fma(b.dt, moved[i] + w[3 + i], p[i]));
+      b.target.position[3 * k + i] = fma(fall, V(plan.gravity[i]), fma(b.dt, rate[9 + i], b.start.position[3 * k + i]));
   }
 }
 
 // The energy–momentum step from q_n with v_n: κ = 1/Δt², T̂ = T_n + Δt V_n + ½ Δt² [0 | g], inertia in the middle of the chord.
-// room: 6 per node.
+// room: 18 per node.
 template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, const V* q, const V* v, V* room) {
   for (int i = 0; i < b.plan.nq; i++) b.q_start[i] = q[i];
   place(b.plan, q, b.start);
@@ -41,24 +50,6 @@ template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, 
   b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5), b.on_chord = true;
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
-}
-
-// Implicit Euler's from q_n, before it q_{n−1}: κ = 1/Δt², T̂ = 2 T_n − T_{n−1} + Δt² [0 | g], inertia at the end. room: nv.
-template <class V, class N> inline void begin_implicit_euler(Balance<V, N>& b, const V* q, const V* before, V* room) {
-  const Plan<N>& plan = b.plan;
-  for (int i = 0; i < plan.nq; i++) b.q_start[i] = q[i];
-  place(plan, q, b.start);
-  place(plan, before, b.target);
-  b.weight = V(1) / (b.dt * b.dt), b.share = V(1), b.on_chord = false;
-  for (int i = 0; i < 9 * plan.nodes; i++)
-    b.target.rotation[i] = fma(V(2), b.start.rotation[i], -b.target.rotation[i]);
-  for (int k = 0; k < plan.nodes; k++)
-    for (int i = 0; i < 3; i++) {
-      V& x = b.target.position[3 * k + i];
-      x = fma(b.dt * b.dt, V(plan.gravity[i]), fma(V(2), b.start.position[3 * k + i], -x));
-    }
-  difference(plan, before, q, room);
-  retract(plan, q, room, V(1), b.q_target);
 }
 
 }  // namespace pbfd

@@ -69,7 +69,8 @@ inline void joint_loads(const Plan<N>& plan, const JointStep<V>& step, const V* 
       quaternion_log(between, d + turn);
       for (int j = 0; j < turn + 3; j++) {
         const int dof = i + j;
-        const V own = what == 0 ? V(plan.spring[dof]) : what == 1 ? V(plan.damping[dof]) * per_dt : V(plan.armature[dof]) * step.weight;
+        const V rotor = V(plan.armature[dof]) * step.weight, damping = V(plan.damping[dof]) * per_dt;
+        const V own = what == 0 ? V(plan.spring[dof]) : what == 1 ? damping : rotor;
         if (residual) residual[dof] = fma(own, d[j], residual[dof]);
         if (matrix && j < turn) matrix[dof * n + dof] += own;
         if (matrix && j == turn) {

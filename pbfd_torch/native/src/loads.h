@@ -7,6 +7,12 @@
 
 namespace pbfd {
 
+// ω · (Σ p × f) + v · Σ f of minus the forces: the virtual work along a unit twist s.
+template <class V> inline V worked(const V* s, const V* moment, const V* force) {
+  const V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
+  return dot(s, torque) + dot(s + 3, force);
+}
+
 // Inertial loads of a node. Their work is done on the chord of the step, or at its end: then both are one.
 template <class V> struct Pull {
   V moment[9], force[3];  // [G | g] of points on the chord

@@ -25,15 +25,15 @@ template <class V, class N> struct Machine {
   Newton<V, N> newton;
   EnergyMomentum<V, N> scheme;
   Velocities<V> before, after;
-  V *q, *guess, *step, *twist;
+  V *q, *guess, *room_to_begin;
 
   static int room(Sizes s) {
-    return Newton<V, N>::room(s) + EnergyMomentum<V, N>::room(s) + 10 * s.nv + 2 * s.nq + s.nv + 6 * s.nodes;
+    return Newton<V, N>::room(s) + EnergyMomentum<V, N>::room(s) + 10 * s.nv + 2 * s.nq + 18 * s.nodes;
   }
   Machine(const Plan<N>& scene, Arena<V>& arena)
       : plan(scene), newton(scene, arena), scheme(scene, arena), before(Velocities<V>::in(arena, scene)),
         after(Velocities<V>::in(arena, scene)) {
-    q = arena.take(plan.nq), guess = arena.take(plan.nq), step = arena.take(plan.nv), twist = arena.take(6 * plan.nodes);
+    q = arena.take(plan.nq), guess = arena.take(plan.nq), room_to_begin = arena.take(18 * plan.nodes);
   }
 
   // One energy–momentum step of worlds first … last − 1.
@@ -103,7 +103,7 @@ template <class V, class N> struct Machine {
 
   void set_out(M fresh) {
     if (!any(fresh)) return;
-    begin_energy_momentum(newton.balance, q, before.v, twist);  // of lanes on their way too: the same again
+    begin_energy_momentum(newton.balance, q, before.v, room_to_begin);  // of lanes on their way too: the same again
     retract(plan, q, before.average, newton.balance.dt, guess);
     newton.begin(fresh, guess);
   }

@@ -49,7 +49,8 @@ template <class N> struct Plan : Sizes {
     carrier = whole(candidates);
     frame = real(9 * nodes), origin = real(3 * nodes), axis = real(3 * nodes), reference = real(nodes);
     mass = real(nodes), center = real(3 * nodes), second = real(9 * nodes);
-    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv), spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
+    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
+    spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
