@@ -77,7 +77,10 @@ inline void joint_loads(const Plan<N>& plan, const JointStep<V>& step, const V* 
           V bent[9];
           log_jacobian(d + turn, zero, bent);
           for (int a = 0; a < 3; a++)
-            for (int b = 0; b < 3; b++) matrix[(dof + a) * n + dof + b] = fma(own, bent[3 * a + b], matrix[(dof + a) * n + dof + b]);
+            for (int b = 0; b < 3; b++) {
+              V& entry = matrix[(dof + a) * n + dof + b];
+              entry = fma(own, bent[3 * a + b], entry);
+            }
         }
       }
     }

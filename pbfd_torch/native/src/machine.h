@@ -126,7 +126,8 @@ template <class V, class N> struct Machine {
     each(a, [&](const T*, T* to, V*, V* from) {
       for (int j = 0; j < plan.nv; j++) to[j * worlds + world] = lane(from[j], i);
     });
-    a.gained_out[world] = lane(after.gained, i), a.surplus_out[world] = lane(after.surplus, i), a.peak_out[world] = lane(after.peak, i);
+    a.gained_out[world] = lane(after.gained, i), a.surplus_out[world] = lane(after.surplus, i);
+    a.peak_out[world] = lane(after.peak, i);
     a.residual_norm[world] = lane(newton.error, i);
     a.status[world] = int(lane(newton.status, i)), a.evaluations[world] = int(lane(newton.evaluations, i));
     a.iterations[world] = int(lane(newton.iterations, i)), a.refused[world] = refused, a.hazards[world] = hazards;

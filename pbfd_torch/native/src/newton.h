@@ -63,7 +63,8 @@ template <class V, class N> struct Newton {
     const V reached = judged(assembled);
     M finite = reached < infinite();
     const M retreating = running & at_guess & !(finite & (reached <= V(RETREAT_ABOVE)));
-    const M lost = running & at_retreat & !finite, usable = running & finite & !retreating, arrived = usable & (reached <= tolerance);
+    const M lost = running & at_retreat & !finite, usable = running & finite & !retreating;
+    const M arrived = usable & (reached <= tolerance);
     evaluations += select(running, V(1), V(0));
     iterations += select(arrived & searching, V(1), V(0));
     error = select(arrived | lost | retreating, reached, error);
@@ -136,7 +137,8 @@ template <class V, class N> struct Newton {
   M shorten(M rejected, V work, bool& assembled) {
     const V curve = curvature(assembled);
     const M low_side = rejected & (work < V(0)), high_side = rejected & !(work < V(0));
-    low = select(low_side, length, low), low_work = select(low_side, work, low_work), low_curve = select(low_side, curve, low_curve);
+    low = select(low_side, length, low), low_work = select(low_side, work, low_work);
+    low_curve = select(low_side, curve, low_curve);
     high = select(high_side, length, high), high_work = select(high_side, work, high_work);
     high_curve = select(high_side, curve, high_curve);
     const V secant = -low_work / (high_work - low_work);

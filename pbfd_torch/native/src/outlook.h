@@ -141,7 +141,8 @@ template <class V, class N> struct Outlook {
     slip_factor(sqrt(max(square, V(0))), width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    df = rises * speed * speed + push * c.faster + c.mu * ((rises * speed * factor + push * falls * on) * on + push * factor * further);
+    const V drags = (rises * speed * factor + push * falls * on) * on + push * factor * further;
+    df = rises * speed * speed + push * c.faster + c.mu * drags;
     return push * speed + c.mu * push * factor * on;
   }
 
