@@ -85,7 +85,10 @@ class Descent:
         refuge = torch.isfinite(p.retreat).all(-1)
         retreating = p.running & (p.stage == AT_GUESS) & ~good & refuge
         last = (p.stage == AT_RETREAT) | ((p.stage == AT_GUESS) & ~refuge)
-        hopeless = ~finite | objective.absurd(evaluation) if isinstance(objective, Sane) else ~finite
+        hopeless = ~finite
+        # what is in the host's own memory it may look at; asking a device would make it wait
+        if isinstance(objective, Sane) and (last.device.type != "cpu" or bool((p.running & last).numpy().any())):
+            hopeless = hopeless | objective.absurd(evaluation)
         lost = p.running & last & hopeless
         usable = p.running & finite & ~retreating & ~lost
         arrived = usable & (error <= self.tolerance_for(p.q.dtype))

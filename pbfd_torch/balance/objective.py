@@ -39,7 +39,7 @@ from pbfd_torch.tree.kinematics import Placement, difference, place, retract
 
 NEGLIGIBLE = 0.1  # of the scale, at most, may be left to rounding
 FARTHEST = 0.5 * math.pi  # [rad] that contacts may turn a joint by in a step
-ABSURD = 1e6  # what is unbalanced where a step begins may move the bodies by so many times their extent, or [rad]
+ABSURD = 1e6  # what drives the bodies may move them by so many times their extent in a step, or [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +108,17 @@ class BalanceObjective:
         lenient = weighted_error(evaluation.residual, self.scale, self.rounding + epsilon * felt, tolerance)
         return torch.where(solved, strict, torch.maximum(lenient, least))
 
-    def absurd(self, evaluation: Evaluation) -> Tensor:
-        """Where the forces are not to be balanced, and no search shall try: what is unbalanced would move the bodies by more than
-        `ABSURD` times their extent, `[*batch]` bool."""
+    def absurd(self, evaluation: Balance) -> Tensor:
+        """Where the forces are not to be balanced, and no search shall try: what drives the bodies, contacts and limits left out,
+        which only answer, would move them by more than `ABSURD` times their extent, `[*batch]` bool."""
+        driving = [
+            load
+            for term, load in zip(self.terms, evaluation.loads, strict=True)
+            if not isinstance(term, Inertia | Armature | Pushing)
+        ]
+        force = Balance(evaluation.placement, driving).residual
         # the rounding is that of κ m x
-        moved = evaluation.residual.abs() / self.rounding * (8 * torch.finfo(self.rounding.dtype).eps)
-        return moved.amax(-1) > ABSURD
+        return (force.abs() / self.rounding * (8 * torch.finfo(self.rounding.dtype).eps)).amax(-1) > ABSURD
 
     def retract(self, q: Tensor, step: Tensor) -> Tensor:
         """q moved by the tangent vector `step`."""
