@@ -68,6 +68,8 @@ Worlds dropped(int first, int count) {
 }  // namespace
 
 int main() {
+  CHECK(pbfd_interface() > 0);
+  CHECK(pbfd_lanes(4) == 2 * pbfd_lanes(8));
   const Worlds all = dropped(0, WORLDS);
   for (int w = 0; w < WORLDS; w++) {
     CHECK(all.counted[0][w] == SOLVED);
