@@ -53,7 +53,13 @@ template <class V, class N> struct Balance {
         chord.position[i] = fma(share, now.position[i] - start.position[i], start.position[i]);
       motion_axes(plan, chord, chord_axes);
     }
-    for (int k = 0; k < plan.nodes; k++) pull(plan, k, weight, share, start, target, now, pulls[k]), pushes[k].clear();
+    for (int k = 0; k < plan.nodes; k++) {
+      pushes[k].any = false;
+      if (any(V(plan.mass[k]) > V(0)))
+        pull(plan, k, weight, share, start, target, now, pulls[k]);
+      else
+        pulls[k].clear();  // a joint that only leads to others
+    }
     contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns, turned);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) {

@@ -81,7 +81,7 @@ inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> n
       for (int a = 0; a < 3; a++) answer[6 * a + b] = fma(n[a], presses, fma(drag, slips[6 * a + b], u[a] * resists));
     }
     Push<V>& out = pushes[k];
-    out.any = true;
+    out.open();
     for (int a = 0; a < 3; a++) {
       out.force[a] -= f[a];
       for (int b = 0; b < 3; b++) out.moment[3 * a + b] = fma(-f[a], p[b], out.moment[3 * a + b]);

@@ -40,17 +40,19 @@ template <class V> struct Push {
   V stiffness[36];
   bool any;  // in some lane
 
-  void clear() {
+  // Nothing is there until something touches: most nodes of most steps are spared the zeros.
+  void open() {
+    if (any) return;
     for (V& x : moment) x = V(0);
     for (V& x : force) x = V(0);
     for (V& x : stiffness) x = V(0);
-    any = false;
+    any = true;
   }
   void add(const Push& o) {
+    open();
     for (int i = 0; i < 9; i++) moment[i] += o.moment[i];
     for (int i = 0; i < 3; i++) force[i] += o.force[i];
     for (int i = 0; i < 36; i++) stiffness[i] += o.stiffness[i];
-    any = true;
   }
 };
 
