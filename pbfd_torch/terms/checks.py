@@ -33,6 +33,6 @@ def _require(what: str, value: float | Tensor, unit: str, fits: Callable[[Tensor
     if bool(good.all()):
         return
     wrong = entries[~good]
-    shown = ", ".join(f"{x:g}" for x in wrong[:3].tolist())
+    shown = ", ".join(str(x) for x in wrong[:3].tolist())
     more = f" and {len(wrong) - 3} more entries" if len(wrong) > 3 else ""
     raise InputError(f"{what} is {shown}{unit and ' ' + unit}{more}: must be {where} and finite")
