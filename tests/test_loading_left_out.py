@@ -8,22 +8,10 @@ from pathlib import Path
 import pytest
 
 from pbfd_torch.errors import NotModelledWarning
-from pbfd_torch.loading import Robot, load_robot
+from pbfd_torch.loading import load_robot
+from tests.mjcf_texts import BODY, loaded, write
 
 JOINTS = Path(__file__).parent / "data" / "joints.xml"
-BODY = "<body name='b'><joint name='j'/><geom name='g' size='1'/></body>"
-
-
-def write(folder: Path, bodies: str, more: str = "") -> Path:
-    file = folder / "robot.xml"
-    file.write_text(f"<mujoco>\n<worldbody>\n{bodies}\n</worldbody>\n{more}\n</mujoco>")
-    return file
-
-
-def loaded(folder: Path, bodies: str = BODY, more: str = "") -> Robot:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotModelledWarning)
-        return load_robot(write(folder, bodies, more))
 
 
 def test_left_out_features_are_listed_and_warned_about() -> None:

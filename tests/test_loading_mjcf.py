@@ -19,21 +19,9 @@ from pbfd_torch.errors import InputError, ModelError, NotModelledWarning
 from pbfd_torch.loading import Robot, load_mjcf, load_robot
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.tree.rotations import quaternion_matrix
+from tests.mjcf_texts import BODY, loaded, write
 
 JOINTS = Path(__file__).parent / "data" / "joints.xml"
-BODY = "<body name='b'><joint name='j'/><geom name='g' size='1'/></body>"
-
-
-def write(folder: Path, bodies: str, more: str = "") -> Path:
-    file = folder / "robot.xml"
-    file.write_text(f"<mujoco>\n<worldbody>\n{bodies}\n</worldbody>\n{more}\n</mujoco>")
-    return file
-
-
-def loaded(folder: Path, bodies: str = BODY, more: str = "") -> Robot:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotModelledWarning)
-        return load_robot(write(folder, bodies, more))
 
 
 @pytest.fixture(scope="module")

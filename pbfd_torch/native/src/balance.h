@@ -126,19 +126,17 @@ template <class V, class N> struct Balance {
     joint_loads(plan, steps(), q, static_cast<V*>(nullptr), matrix);
   }
 
- private:
   JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }
+
+ private:
   const V* inertial_axis(int j) const { return (on_chord ? chord_axes : axes) + 6 * j; }
   static V along(const V* a, const V* b) { return dot(a, b) + dot(a + 3, b + 3); }
 
   // A s, or (A + w B) s where the points move on the chord.
   void answer(const Pull<V>& p, const V* s, bool moved, V* out) const {
-    const V *w = s, *v = s + 3, sum = trace(p.second);
-    times(p.second, w, out);
-    for (int i = 0; i < 3; i++) out[i] = fma(sum, w[i], -out[i]), out[3 + i] = p.mass * v[i];
-    add_cross(p.on_chord, v, out);
-    add_cross(w, p.first, out + 3);
+    p.answer(s, out);
     if (!moved) return;
+    const V *w = s, *v = s + 3;
     V torque[3], beside[3];
     const V whole = trace(p.at_end);
     transposed_times(p.at_end, w, torque);

@@ -70,8 +70,8 @@ template <class V, class N> struct EnergyMomentum {
       other[i] = momentum[i] - row - h * smooth[i];
       after.v[i] = momentum[i], after.push[i] = impulse[i];
     }
-    factor();
-    resolve(after.v), resolve(after.push);
+    factor_along_the_tree(plan, matrix);
+    substitute_along_the_tree(plan, matrix, after.v), substitute_along_the_tree(plan, matrix, after.push);
     V kept(0), whole(0);
     for (int i = 0; i < n; i++) kept = fma(impulse[i], before.push[i], kept), whole = fma(impulse[i], after.push[i], whole);
     const V share = clamped(kept / select(whole > zero, whole, V(1)), zero, V(1));
@@ -79,7 +79,7 @@ template <class V, class N> struct EnergyMomentum {
       after.lag[i] = -ahead(i) * (other[i] - (V(1) - share) * impulse[i]);
       after.steady[i] = share * after.push[i];
     }
-    resolve(after.lag);
+    substitute_along_the_tree(plan, matrix, after.lag);
 
     for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
     const V first = kinetic(b.start, b.chord_axes, total);
@@ -132,7 +132,7 @@ template <class V, class N> struct EnergyMomentum {
 
   // Generalised forces of contacts, limits and dry friction, and of what is `Fitted`, as if taken whole.
   void split_forces(const Balance<V, N>& b, const V* q) {
-    const JointStep<V> step{b.q_start, b.q_target, b.control, b.dt, b.weight};
+    const JointStep<V> step = b.steps();
     for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = V(0);
     joint_loads<SMOOTH>(plan, step, q, smooth, static_cast<V*>(nullptr));
     joint_loads<ROUGH>(plan, step, q, rough, static_cast<V*>(nullptr));
@@ -189,12 +189,8 @@ template <class V, class N> struct EnergyMomentum {
     for (int i = 0; i < n * n; i++) matrix[i] = V(0);
     each_freedom([&](int k, int j) {
       const Pull<V>& p = sums[k];
-      const V *s = b.axes + 6 * j, sum = trace(p.second);
       V below[6];
-      times(p.second, s, below);
-      for (int i = 0; i < 3; i++) below[i] = fma(sum, s[i], -below[i]), below[3 + i] = p.mass * s[3 + i];
-      add_cross(p.first, s + 3, below);
-      add_cross(s, p.first, below + 3);
+      p.answer(b.axes + 6 * j, below);
       for (int up = k; up >= 0; up = plan.parent[up])
         for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++) {
           const V* t = b.axes + 6 * i;
@@ -203,9 +199,6 @@ template <class V, class N> struct EnergyMomentum {
       matrix[j * n + j] += V(plan.armature[j]);
     });
   }
-
-  void factor() { factor_along_the_tree(plan, matrix); }
-  void resolve(V* x) const { substitute_along_the_tree(plan, matrix, x); }
 };
 
 }  // namespace pbfd

@@ -20,6 +20,14 @@ template <class V> struct Pull {
   V second[9];            // Σ m p p̄ᵀ, p at the end, p̄ on the chord
   V first[3], on_chord[3], mass;  // Σ m p, Σ m p̄, Σ m
 
+  // How the wrench on the points of the chord answers a unit twist s = (ω, v) of the node: A s.
+  void answer(const V* s, V* out) const {
+    const V *w = s, *v = s + 3, sum = trace(second);
+    times(second, w, out);
+    for (int i = 0; i < 3; i++) out[i] = fma(sum, w[i], -out[i]), out[3 + i] = mass * v[i];
+    add_cross(on_chord, v, out);
+    add_cross(w, first, out + 3);
+  }
   void clear() {
     for (V& x : moment) x = V(0);
     for (V& x : at_end) x = V(0);

@@ -121,21 +121,22 @@ template <class V, class N> struct Newton {
   }
   V extent(int j) const { return select(V(plan.turns[j]) > V(0), V(1), far); }
 
-  V curvature(bool& assembled) {
+  // dᵀJd, the slope of the work along d, where J is assembled.
+  V curvature(const V* d) const {
     const int n = plan.nv;
-    if (!assembled) balance.assemble(trial, true), assembled = true;
     V sum(0);
     for (int i = 0; i < n; i++) {
       V row(0);
-      for (int j = 0; j < n; j++) row = fma(balance.matrix[i * n + j], direction[j], row);
-      sum = fma(row, direction[i], sum);
+      for (int j = 0; j < n; j++) row = fma(balance.matrix[i * n + j], d[j], row);
+      sum = fma(row, d[i], sum);
     }
     return sum;
   }
 
   // A trial went too far, or a shortened one not far enough: another length within the bracket. Who has none left.
   M shorten(M rejected, V work, bool& assembled) {
-    const V curve = curvature(assembled);
+    if (!assembled) balance.assemble(trial, true), assembled = true;
+    const V curve = curvature(direction);
     const M low_side = rejected & (work < V(0)), high_side = rejected & !(work < V(0));
     low = select(low_side, length, low), low_work = select(low_side, work, low_work);
     low_curve = select(low_side, curve, low_curve);
@@ -177,13 +178,7 @@ template <class V, class N> struct Newton {
       }
       work = against(saved);
       balance.assemble(trial, true);
-      V other(0);
-      for (int i = 0; i < n; i++) {
-        V row(0);
-        for (int j = 0; j < n; j++) row = fma(balance.matrix[i * n + j], saved[j], row);
-        other = fma(row, saved[i], other);
-      }
-      curve = select(direct, curve, other);
+      curve = select(direct, curve, curvature(saved));
     }
     V turn(MAX_TURN);
     for (int i = 0; i < n; i++) turn = max(turn, abs(saved[i]) * V(plan.turns[i]));
@@ -205,7 +200,6 @@ template <class V, class N> struct Newton {
     return sum;
   }
   static M descends(V work) { return (work < V(0)) & (abs(work) < infinite()); }
-
 };
 
 }  // namespace pbfd
