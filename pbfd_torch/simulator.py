@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, Generic, Self
+from dataclasses import dataclass
+from typing import Any, Generic, Self, cast
 
 from torch import Tensor
 
@@ -15,7 +16,11 @@ from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linearization import Linearization, linearized
 from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
+from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.native.engine import Engine, Torch, chosen
+from pbfd_torch.native.rollout import rolled_out as many_rolled_out
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.schedules.adaptive import AdaptiveStepper
@@ -34,6 +39,9 @@ class Simulator(Generic[S]):
     nothing else solves it; 0: never. `evaluations`: the most that a world may spend on a step, with all that is tried; what is not
     solved by then is unsolved. `gradients`: how steps are differentiated (`gradients.implicit`).
 
+    `engine`: what makes the steps (`native.engine`): `Native()`, the compiled core, or `Torch()`; None: the core where it covers
+    them, else PyTorch, and `engine_reason` says why. Raises `InputError` where the core is asked for and cannot.
+
     `stepper` makes the steps. `eager` makes them in PyTorch: it knows their balance, and derivatives retrace them with it."""
 
     def __init__(
@@ -45,58 +53,81 @@ class Simulator(Generic[S]):
         halvings: int = 3,
         gradients: Gradients | None = None,
         evaluations: int = MOST_EVALUATIONS,
+        engine: Engine | None = None,
     ) -> None:
         self.eager: EagerStepper[S] = EagerStepper(scene, dt, integrator, solver, halvings, evaluations)
-        self.stepper: Stepper[S] = self.eager
         self.gradients = gradients or Gradients()
+        self._engine = engine
+        self._made: tuple[Stepper[S], str, str] | None = None  # the stepper, its engine, and why it is no other; when asked for
+        if engine is not None:
+            self._stepping()
+
+    def _stepping(self) -> tuple[Stepper[S], str, str]:
+        if self._made is None:
+            engine, reason = (self._engine, "") if self._engine is not None else chosen(self.eager)
+            self._made = engine.stepper(self.eager), engine.name, reason
+        return self._made
+
+    @property
+    def stepper(self) -> Stepper[S]:
+        """What makes the steps."""
+        return self._stepping()[0]
+
+    @property
+    def engine(self) -> str:
+        """The name of the engine that makes the steps: `native` or `torch`."""
+        return self._stepping()[1]
+
+    @property
+    def engine_reason(self) -> str:
+        """Why the steps are not compiled, in words; empty where they are, or where the engine was asked for."""
+        return self._stepping()[2]
 
     @property
     def scene(self) -> Scene:
         """What moves, and all that acts on it."""
-        return self.stepper.scene
+        return self.eager.scene
 
     @property
     def articulation(self) -> Articulation:
         """The scene's bodies."""
-        return self.stepper.scene.articulation
+        return self.eager.scene.articulation
 
     @property
     def integrator(self) -> Integrator[S]:
         """The scheme that says what a step is."""
-        return self.stepper.integrator
+        return self.eager.integrator
 
     @property
     def solver(self) -> Solver:
         """What finds the end of a step."""
-        return self.stepper.solver
+        return self.eager.solver
 
     @property
     def halvings(self) -> int:
         """How often a world's step may be halved."""
-        return self.stepper.halvings
+        return self.eager.halvings
 
     @property
     def dt(self) -> float:
         """The step [s]."""
-        return self.stepper.dt
+        return self.eager.dt
 
     @property
     def step_size(self) -> Tensor:
         """The step [s] as a tensor, which may carry derivatives."""
-        return self.stepper.step_size
+        return self.eager.step_size
 
     def sized(self, step_size: Tensor) -> Self:
         """The same simulator with steps [s] of another length `[]`, or of one for each world `[*batch]`."""
         other = copy.copy(self)
-        other.eager = self.eager.sized(step_size)
-        other.stepper = other.eager if self.stepper is self.eager else self.stepper.sized(step_size)
+        other.eager, other._made = self.eager.sized(step_size), None
         return other
 
     def with_scene(self, scene: Scene) -> Self:
         """The same simulator of the same scene with other numbers: as a new one would be, but no device is asked for anything."""
         other = copy.copy(self)
-        other.eager = self.eager.with_scene(scene)
-        other.stepper = other.eager
+        other.eager, other._made = self.eager.with_scene(scene), None
         return other
 
     def initial_state(self, q: Array | None = None, v: Array | None = None, control: Array | None = None) -> S:
@@ -164,7 +195,22 @@ class Simulator(Generic[S]):
         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
         with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed.
         Raises `ContactOverflowError`, which holds the steps done, where the scene asks for it."""
-        return rolled_out(self.stepper, state, controls, steps, progress)
+        stepper: Stepper[Any] = self.stepper
+        if isinstance(stepper, NativeStepper):
+            return many_rolled_out(stepper, cast(Velocities, state), controls, steps, progress)
+        return rolled_out(stepper, state, controls, steps, progress)
+
+
+@dataclass(frozen=True)
+class _Adaptive(Torch):
+    """Steps in PyTorch that each world chooses the length of."""
+
+    accuracy: float
+    shortest: float | None
+
+    def stepper(self, eager: EagerStepper[Any]) -> AdaptiveStepper[Any]:
+        """See `Engine`."""
+        return AdaptiveStepper(eager, self.accuracy, self.shortest)
 
 
 class AdaptiveSimulator(Simulator[S]):
@@ -183,8 +229,7 @@ class AdaptiveSimulator(Simulator[S]):
         solver: Solver | None = None,
         shortest: float | None = None,
     ) -> None:
-        super().__init__(scene, dt, integrator, solver, halvings=0)
-        self.stepper = AdaptiveStepper(self.eager, accuracy, shortest)
+        super().__init__(scene, dt, integrator, solver, halvings=0, engine=_Adaptive(accuracy, shortest))
 
     def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but

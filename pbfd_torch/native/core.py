@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+import dataclasses
+import itertools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -13,10 +16,13 @@ from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
-from pbfd_torch.tensors.worlds import replaced
 
 VECTORS = ("q", "v", "push", "steady", "lag", "average")
 NUMBERS = ("gained", "surplus", "peak")
+COUNTED = ("status", "evaluations", "iterations", "refused", "hazards")
+ALIGNMENT = 64
+WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
+BLOCKS = 4  # for each thread: some worlds take longer than others
 
 
 class _Plan(ctypes.Structure):
@@ -27,19 +33,22 @@ class _Plan(ctypes.Structure):
     )
 
 
-class _Step(ctypes.Structure):
+class _Steps(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus")),
-        *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last")),
-        ("given", ctypes.c_void_p * 10),
-        ("found", ctypes.c_void_p * 10),
+        *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
+        ("made", ctypes.c_void_p),
+        ("given", ctypes.c_void_p * 9),
+        ("control", ctypes.c_void_p),
+        ("found", ctypes.c_void_p * 9),
+        ("residual_norm", ctypes.c_void_p),
         ("counted", ctypes.c_void_p * 5),
     )
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What a step is asked for. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; evaluations: at most."""
+    """What steps are asked for. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; evaluations: at most, of each."""
 
     dt: float
     tolerance: float
@@ -47,63 +56,107 @@ class Terms:
     evaluations: int
 
 
-class Core:
-    """A scene's plan in the compiled library. Raises `ValueError` where both do not fit together."""
+class Journey:
+    """Several steps of all worlds, as far as the core has made them.
 
-    def __init__(self, library: Library, plan: Plan) -> None:
-        self.plan = plan
+    Attributes:
+        given: the fields of the state `[*batch, ...]` that each world goes on from.
+        control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps.
+        fields: of the state after each step, `[steps, *batch, ...]`.
+        residual_norm, counted, fallbacks: how each was solved, `[steps, *batch, ...]`.
+        made: `[*batch]`, how many of its steps each world has made; the next one stopped it, and its end is there.
+    """
+
+    def __init__(self, state: Velocities, control: Tensor, steps: int) -> None:
+        batch, self.steps = tuple(state.q.shape[:-1]), steps
+        self.given = {name: _whole(getattr(state, name), (*batch, getattr(state, name).shape[-1])) for name in VECTORS}
+        self.given |= {name: _whole(getattr(state, name), batch) for name in NUMBERS}
+        self.control = _whole(control, (len(control), *batch, control.shape[-1]))
+        self.fields = {name: x.new_empty((steps, *x.shape)) for name, x in self.given.items()}
+        self.residual_norm = state.q.new_empty((steps, *batch))
+        self.counted = {name: torch.empty((steps, *batch), dtype=torch.int32) for name in COUNTED}
+        self.fallbacks = torch.zeros((steps, *batch, len(FALLBACKS)), dtype=torch.int32)
+        self.made = torch.zeros(batch, dtype=torch.int32)
+
+    def call(self, terms: Terms) -> _Steps:
+        """What the core is to be asked."""
+        held = len(self.control) == 1
+        asked = _Steps(*dataclasses.astuple(terms), self.made.numel(), 0, self.made.numel(), self.steps, held)
+        asked.made, asked.control = self.made.data_ptr(), self.control.data_ptr()
+        asked.residual_norm = self.residual_norm.data_ptr()
+        for array, values in ((asked.given, self.given), (asked.found, self.fields), (asked.counted, self.counted)):
+            for i, x in enumerate(values.values()):
+                array[i] = x.data_ptr()
+        return asked
+
+    @property
+    def stopped(self) -> Tensor:
+        """Positions in the flattened batch of the worlds that have steps to make yet."""
+        return (self.made.reshape(-1) < self.steps).nonzero().squeeze(-1)
+
+    @property
+    def solution(self) -> Solution:
+        """How the steps were solved, `[steps, *batch, ...]`."""
+        counted = {name: x for name, x in self.counted.items() if name not in ("refused", "hazards")}
+        lanes = int(counted["evaluations"].sum())
+        return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
+
+
+class Core:
+    """A scene's plan in the compiled library. `threads`: at most, of those that share a call's worlds. Raises `ValueError` where
+    both do not fit together."""
+
+    def __init__(self, library: Library, plan: Plan, threads: int) -> None:
+        self.plan, self._threads = plan, threads
         self._functions = library.functions
-        for name in ("pbfd_whole_numbers", "pbfd_real_numbers", "pbfd_room"):
-            getattr(self._functions, name).restype = ctypes.c_long
-        sizes = plan.sizes
-        self._plan = _Plan(plan.real.element_size(), *sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        self._plan = _Plan(plan.real.element_size(), *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (plan.whole.numel(), plan.real.numel()):
             raise ValueError(f"the plan has {plan.whole.numel()} and {plan.real.numel()} numbers: the core wants {wanted}")
-        self._room = self._asked("pbfd_room")
+        self._room = self._asked("pbfd_room") + ALIGNMENT
+        self._rooms: list[Tensor] = []  # that no call is in
+        self._lanes = library.lanes(plan.real.dtype)
 
     def _asked(self, name: str) -> int:
         return int(getattr(self._functions, name)(ctypes.byref(self._plan)))
 
-    def energy_momentum(self, state: Velocities, control: Tensor | None, terms: Terms) -> tuple[Velocities, Solution, Tensor]:
-        """One step of all worlds: the state after it, how it was solved, and which worlds `[*batch]` the scheme refuses. The
-        numbers that a step remembers besides are the state's own."""
-        batch = tuple(state.q.shape[:-1])
-        worlds = state.q[..., 0].numel()
-        like = state.q
-        if control is None:
-            control = like.new_zeros(self.plan.sizes[3])
-        given = [_last(getattr(state, name), batch, worlds) for name in VECTORS]
-        given += [getattr(state, name).expand(batch).reshape(worlds).contiguous() for name in NUMBERS]
-        given.append(_last(control, batch, worlds))
-        found = [torch.empty_like(x) for x in given[:9]] + [like.new_empty(worlds)]
-        counted = [torch.empty(worlds, dtype=torch.int32) for _ in range(5)]
-        room = torch.empty(self._room + 64, dtype=torch.uint8)
-        step = _Step(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, worlds, 0, worlds)
-        for array, values in ((step.given, given), (step.found, found), (step.counted, counted)):
-            for i, x in enumerate(values):
-                array[i] = x.data_ptr()
-        aligned = (room.data_ptr() + 63) // 64 * 64
-        self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(step), ctypes.c_void_p(aligned))
+    def go(self, journey: Journey, terms: Terms) -> None:
+        """Makes the steps of a journey as far as every world comes, on several threads where that is worth it: worlds do not know
+        of each other, and it makes no difference to any."""
+        asked = journey.call(terms)
+        blocks = min(BLOCKS * self._threads, asked.worlds * asked.steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
+        if self._threads == 1 or blocks < 2:
+            self._make(asked)
+            return
+        calls = []
+        for first, last in _blocks(asked.worlds, blocks, self._lanes):
+            part = _Steps.from_buffer_copy(asked)
+            part.first, part.last = first, last
+            calls.append(part)
+        list(_pool(self._threads).map(self._make, calls))
 
-        def shaped(x: Tensor) -> Tensor:
-            return x.mT.contiguous().reshape(*batch, -1) if x.ndim == 2 else x.reshape(batch)
-
-        fields = {name: shaped(x) for name, x in zip((*VECTORS, *NUMBERS), found, strict=False)}
-        status, evaluations, iterations, refused, hazards = (shaped(x) for x in counted)
-        after = replaced(state, **fields, time=state.time + terms.dt, hazards=hazards)
-        solution = Solution(
-            q=after.q,
-            status=status,
-            residual_norm=shaped(found[-1]),
-            iterations=iterations,
-            evaluations=evaluations,
-            fallbacks=evaluations.new_zeros((*batch, len(FALLBACKS))),
-            lanes=int(evaluations.sum()),
-        )
-        return after, solution, refused.to(torch.bool)
+    def _make(self, asked: _Steps) -> None:
+        try:
+            room = self._rooms.pop()
+        except IndexError:
+            room = torch.empty(self._room, dtype=torch.uint8)
+        aligned = -(-room.data_ptr() // ALIGNMENT) * ALIGNMENT
+        self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(asked), ctypes.c_void_p(aligned))
+        self._rooms.append(room)
 
 
-def _last(values: Tensor, batch: Sequence[int], worlds: int) -> Tensor:
-    """`[*batch, n]` → `[n, worlds]`: worlds lie side by side."""
-    return values.expand(*batch, values.shape[-1]).reshape(worlds, values.shape[-1]).mT.contiguous()
+def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """All numbers of a tensor that may be one for several worlds, one after the other."""
+    return values.expand(shape).contiguous()
+
+
+def _blocks(worlds: int, count: int, lanes: int) -> list[tuple[int, int]]:
+    """Worlds from … to, in so many parts of whole registers."""
+    registers = -(-worlds // lanes)
+    bounds = [min(worlds, registers * i // count * lanes) for i in range(count + 1)]
+    return list(itertools.pairwise(bounds))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "pbfd")

@@ -15,7 +15,7 @@ import torch
 from pbfd_torch.errors import InputError
 from pbfd_torch.native.processor import runnable
 
-INTERFACE = 2  # the version of src/interface.h that this file knows
+INTERFACE = 3  # the version of src/interface.h that this file knows
 FOLDER = Path(__file__).parent / "lib"
 CHOICE = "PBFD_NATIVE_TARGET"
 REMEDY = "install g++ and run pip install again, with --force-reinstall --no-deps --no-cache-dir"
@@ -60,6 +60,8 @@ def loaded(file: Path) -> Library | str:
     if (version := functions.pbfd_interface()) != INTERFACE:
         return f"the native library has interface {version}, and this is pbfd_torch for interface {INTERFACE}: {REMEDY}"
     functions.pbfd_target.restype = ctypes.c_char_p
+    for name in ("pbfd_whole_numbers", "pbfd_real_numbers", "pbfd_room"):
+        getattr(functions, name).restype = ctypes.c_long
     return Library(functions.pbfd_target().decode(), functions)
 
 

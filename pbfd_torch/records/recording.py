@@ -14,6 +14,7 @@ from pbfd_torch.records.depiction import depicted
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.load import Hazardous
@@ -32,10 +33,14 @@ class Records:
     def _begin(self, start: dict[str, Tensor]) -> None:
         """The state at the start."""
         for name, value in start.items():
-            self._entries[name] = [value]
+            self._entries[name] = [value[None]]
 
     def _add(self, solution: Solution, entries: dict[str, Tensor]) -> None:
-        """One step, all at once: an interruption before this leaves the record as it was."""
+        """One step."""
+        self._add_several(mapped(_one, solution), {name: value[None] for name, value in entries.items()})
+
+    def _add_several(self, solution: Solution, entries: dict[str, Tensor]) -> None:
+        """Steps `[steps, *batch, ...]`, all at once: an interruption before this leaves the record as it was."""
         solved = {
             "status": solution.status,
             "iterations": solution.iterations,
@@ -46,7 +51,7 @@ class Records:
         }
         for name, value in (entries | solved).items():
             self._entries.setdefault(name, []).append(value)
-        self.steps += 1
+        self.steps += len(solution.status)
         self._lanes += solution.lanes
 
     def _seen(self, placement: Placement, v: Tensor, rates: Tensor, stored: Tensor) -> dict[str, Tensor]:
@@ -66,7 +71,7 @@ class Records:
 
     def finish(self, lanes: int | None = None) -> Rollout:
         """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
-        stacked = {name: torch.stack(_alike(values)) for name, values in self._entries.items()}
+        stacked = {name: torch.cat(_alike(values)) for name, values in self._entries.items()}
         like, a = stacked["q"], self._scene.articulation
         if "contact_depth" not in stacked:
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
@@ -125,6 +130,13 @@ class Recorder(Records):
 
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
         """One solved step: the state after it, how it was solved, and its contacts."""
+        self._add(solution, self._step(state, objective))
+
+    def record_several(self, states: State, solution: Solution, objective: BalanceObjective) -> None:
+        """Several solved steps, each value `[steps, *batch, ...]`; the balance is that of all of them."""
+        self._add_several(solution, self._step(states, objective))
+
+    def _step(self, state: State, objective: BalanceObjective) -> dict[str, Tensor]:
         placement = place(self._scene.articulation, state.q)
         entries = self._state(state, placement) | {"hazards": state.hazards, "suspect": self._suspect(state, objective, placement)}
         pairs = zip(objective.terms, objective.prepared, strict=True)
@@ -134,7 +146,7 @@ class Recorder(Records):
             entries["contact_depth"] = torch.cat([x.depth for x in points], -1)
             for name in _CONTACT:
                 entries[name] = torch.cat([getattr(x, name.removeprefix("contact_")) for x in points], -2)
-        self._add(solution, entries)
+        return entries
 
     def _suspect(self, state: State, objective: BalanceObjective, placement: Placement) -> Tensor:
         """Of the worlds whose step has a hazard what is deepest beyond its measure, `[*batch]`; see `Rollout`."""
@@ -158,8 +170,13 @@ _CONTACT = ("contact_point", "contact_normal", "contact_force", "contact_slip")
 
 def _alike(values: list[Tensor]) -> list[Tensor]:
     """The same values, those of contacts with as many slots as the step with the most of them: the number may grow."""
-    most = [max(sizes) for sizes in zip(*(x.shape for x in values), strict=True)]
-    return [_padded(x, most) for x in values]
+    most = [max(sizes) for sizes in zip(*(x.shape[1:] for x in values), strict=True)]
+    return [_padded(x, [len(x), *most]) for x in values]
+
+
+def _one(value: Tensor) -> Tensor:
+    """A step as the only one."""
+    return value[None]
 
 
 def _padded(value: Tensor, shape: list[int]) -> Tensor:

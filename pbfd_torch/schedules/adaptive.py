@@ -15,6 +15,7 @@ from typing import Generic, Self
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.scene import Scene
@@ -86,6 +87,10 @@ class AdaptiveStepper(Generic[S]):
             while frame.advance():
                 pass
             return frame.finish()
+
+    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
+        """See `Stepper`: of a step as long as the frame."""
+        return self.fixed.objective(state, control)
 
     def take(self, worlds: Worlds) -> Self:
         """See `Stepper`."""

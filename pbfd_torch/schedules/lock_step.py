@@ -25,9 +25,9 @@ def rolled_out(
     recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, state)
     try:
         for k in range(count):
-            state, solution, way = stepper.made(state, None if controls is None else controls[k])
-            assert way.objective is not None
-            recorder.record(state, solution, way.objective)
+            before, control = state, None if controls is None else controls[k]
+            state, solution, way = stepper.made(before, control)
+            recorder.record(state, solution, way.objective or stepper.objective(before, control))
             if progress is not None:
                 progress(k + 1)
     except KeyboardInterrupt:

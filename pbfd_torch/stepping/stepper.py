@@ -12,6 +12,7 @@ from typing import Protocol, Self
 
 from torch import Tensor
 
+from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Relaxable, Solution
@@ -70,6 +71,10 @@ class Stepper(Protocol[S]):
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """A step of all worlds under a control `[*batch, nu]` (None: zero): the state after it, how it was solved, and how it was
         made. Never raises for one bad world; an unsolved one goes on from the best point found."""
+        ...
+
+    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
+        """The balance of forces that the step from `state` solves."""
         ...
 
     def take(self, worlds: Worlds) -> Self:

@@ -109,7 +109,7 @@ class Live(Served):
     def _advanced(self) -> tuple[Any, Any, Any]:
         before = self._state
         self._state, solution, way = self._simulator.stepper.made(before, self._control)
-        return before, solution, way.objective
+        return before, solution, way.objective or self._simulator.objective(before, self._control)
 
     def _record(self, before: Any, solution: Any, objective: Any) -> Rollout:
         recorder = Recorder(self._simulator.scene, self._simulator.integrator, self._dt, before)

@@ -35,6 +35,9 @@ template <class V, class N> struct EnergyMomentum {
     sums = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
   }
 
+  // At t_n.
+  V velocity(const Velocities<V>& x, int i) const { return fma(V(0.5), x.steady[i] + x.lag[i], x.v[i]); }
+
   // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it.
   M advance(Balance<V, N>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
     const int n = plan.nv;

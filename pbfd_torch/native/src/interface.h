@@ -19,15 +19,23 @@ struct pbfd_plan {
   const void* real;
 };
 
-// One step of worlds `first` … `last` − 1, each array [count, worlds]:
-//   given: q, v, push, steady, lag, average, gained, surplus, peak of the state (`Velocities`), and the control;
-//   found: the same of the state after the step, and ‖r/scale‖; counted: status, evaluations, iterations, refused, hazards.
-struct pbfd_step {
+// Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
+//   given: q, v, push, steady, lag, average, gained, surplus, peak of the state (`Velocities`) that each world goes on from;
+//   control: [worlds, nu] for all steps if `held`, else [steps, worlds, nu];
+//   made: [worlds], how many of its steps each world has made: it goes on with the next one, and stops before one that is not solved
+//     or is refused;
+//   found: what is given, after each step [steps, …], that which stopped a world included;
+//   residual_norm, counted (status, evaluations, iterations, refused, hazards): [steps, worlds].
+struct pbfd_steps {
   double dt, tolerance, surplus;
-  int evaluations;  // at most, of each world
+  int evaluations;  // at most, of each world in each step
   int worlds, first, last;
-  const void* given[10];
-  void* found[10];
+  int steps, held;
+  int* made;
+  const void* given[9];
+  const void* control;
+  void* found[9];
+  void* residual_norm;
   int* counted[5];
 };
 
@@ -36,5 +44,5 @@ PBFD_FUNCTION long pbfd_whole_numbers(const pbfd_plan*);
 PBFD_FUNCTION long pbfd_real_numbers(const pbfd_plan*);
 PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 
-// The energy–momentum step by Newton's method from the guess or from θ_n: what it leaves unsolved, and what it refuses, it says.
-PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_step*, void* room);
+// Energy–momentum steps by Newton's method from the guess or from θ_n.
+PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);

@@ -6,7 +6,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 2; }
+int pbfd_interface() { return 3; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -16,23 +16,24 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
 
-template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
+template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
   const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   Arena<V> arena{static_cast<V*>(room)};
   Machine<V, T> machine(plan, arena);
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
-  const StepArrays<T> arrays{
-      given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), given(9),
-      found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), found(9),
+  const Journey<T> journey{
+      s->worlds, s->steps, s->held != 0, s->made,
+      given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), static_cast<const T*>(s->control),
+      found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), static_cast<T*>(s->residual_norm),
       s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
   machine.scheme.surplus_allowed = V(T(s->surplus));
-  machine.run(arrays, s->worlds, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
+  machine.run(journey, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_step* s, void* room) {
+template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   if (s->last - s->first == 1)
     energy_momentum<T>(p, s, room);
   else
@@ -52,6 +53,6 @@ long pbfd_room(const pbfd_plan* p) {
   return long(register_bytes) * (wide > narrow ? wide : narrow);
 }
 
-void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
+void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   p->bytes == 8 ? energy_momentum_of<double>(p, s, room) : energy_momentum_of<float>(p, s, room);
 }

@@ -52,7 +52,7 @@ template <class V, class N> struct Newton {
     running = running | which, at_guess = at_guess | which;
     searching = searching & !which, at_retreat = at_retreat & !which;
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
-    error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status), high = select(which, infinite(), high);
+    error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status), high = select(which, infinite<V>(), high);
   }
 
   // One evaluation of every lane that runs, and what it does next.
@@ -61,7 +61,7 @@ template <class V, class N> struct Newton {
     balance.evaluate(trial);
     bool assembled = false;
     const V reached = judged(assembled);
-    M finite = reached < infinite();
+    M finite = reached < infinite<V>();
     const M retreating = running & at_guess & !(finite & (reached <= V(RETREAT_ABOVE)));
     const M lost = running & at_retreat & !finite, usable = running & finite & !retreating;
     const M arrived = usable & (reached <= tolerance);
@@ -74,8 +74,8 @@ template <class V, class N> struct Newton {
 
     V work(0);
     for (int i = 0; i < n; i++) work = fma(balance.residual[i], direction[i], work);
-    work = select(abs(work) < infinite(), work, infinite());
-    const M good = (abs(work) <= V(OVERSHOOT) * abs(start_work)) | ((work < V(0)) & !(high < infinite()));
+    work = select(abs(work) < infinite<V>(), work, infinite<V>());
+    const M good = (abs(work) <= V(OVERSHOOT) * abs(start_work)) | ((work < V(0)) & !(high < infinite<V>()));
     const M accept = usable & !arrived & ((!searching) | good), rejected = running & searching & !accept;
     M stalled(false);
     if (any(rejected)) stalled = shorten(rejected, work, assembled);
@@ -92,8 +92,6 @@ template <class V, class N> struct Newton {
   }
 
  private:
-  static V infinite() { return V(T(1) / T(0)); }
-
   // ‖r / (scale + rounding/tolerance)‖ (BalanceObjective.error). What rounded coordinates make of J is asked where it may decide.
   V judged(bool& assembled) {
     const int n = plan.nv;
@@ -143,7 +141,7 @@ template <class V, class N> struct Newton {
     high = select(high_side, length, high), high_work = select(high_side, work, high_work);
     high_curve = select(high_side, curve, high_curve);
     const V secant = -low_work / (high_work - low_work);
-    const V line = clamped(select(high_work < infinite(), secant, V(0.1)), V(0.1), V(0.9));
+    const V line = clamped(select(high_work < infinite<V>(), secant, V(0.1)), V(0.1), V(0.9));
     const V share = touching_share(low_work, low_curve, high_work, high_curve, high - low, line);
     length = select(rejected, fma(share, high - low, low), length);
     const V shortest = sizeof(T) == 8 ? V(3.0e-13) : V(2.9e-6);  // ε^.8
@@ -191,7 +189,7 @@ template <class V, class N> struct Newton {
     for (int i = 0; i < plan.nq; i++) q[i] = select(accept, trial[i], q[i]);
     length = select(accept, first, length), start_work = select(accept, work, start_work);
     low = select(accept, V(0), low), low_work = select(accept, work, low_work), low_curve = select(accept, curve, low_curve);
-    high = select(accept, infinite(), high);
+    high = select(accept, infinite<V>(), high);
   }
 
   V against(const V* d) const {
@@ -199,7 +197,7 @@ template <class V, class N> struct Newton {
     for (int i = 0; i < plan.nv; i++) sum = fma(balance.residual[i], d[i], sum);
     return sum;
   }
-  static M descends(V work) { return (work < V(0)) & (abs(work) < infinite()); }
+  static M descends(V work) { return (work < V(0)) & (abs(work) < infinite<V>()); }
 };
 
 }  // namespace pbfd

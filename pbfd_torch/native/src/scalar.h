@@ -137,6 +137,8 @@ template <class V> inline V max(V a, V b) { return select(a > b, a, b); }
 template <class V> inline V abs(V a) { return select(a < V(0), -a, a); }
 template <class V> inline V clamped(V a, V low, V high) { return min(max(a, low), high); }
 
+template <class V> inline V infinite() { return V(typename Kind<V>::Scalar(HUGE_VAL)); }
+
 // The nearest whole number: what is added pushes all other bits out.
 template <class V> inline V rounded(V a) {
   const V shift = sizeof(typename Kind<V>::Scalar) == 8 ? V(6755399441055744.0) : V(12582912.0);
