@@ -37,9 +37,9 @@ def started(
 
 def test_many_steps_are_the_steps_one_by_one() -> None:
     """To the bit, also where some worlds are led on in PyTorch on the way, and where one stands still."""
-    stepper, state, controls = started("walker", 0.02, 9, 12)
+    stepper, state, controls = started("walker", 0.02, 9, 8)
     controls[:, 4] = torch.nan
-    states, solution = stepper.run(state, controls, 12)
+    states, solution = stepper.run(state, controls, 8)
     for k, control in enumerate(controls):
         state, one, _ = stepper.made(state, control)
         for field in FIELDS:
