@@ -11,6 +11,7 @@ import torch
 
 from pbfd_torch import Simulator
 from pbfd_torch.models.chains import chain_fixed, chain_ground, chain_slope_drop
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.terms.actuators import Actuator
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -173,7 +174,7 @@ def test_interrupted_rollout_keeps_what_it_has() -> None:
 @pytest.mark.parametrize("call", [1, 3])
 def test_interruption_inside_a_step(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
     """KeyboardInterrupt while a step is recorded: the steps before it are kept, whole; where there are none it comes through."""
-    simulator = Simulator(ball(), 0.02)
+    simulator = Simulator(ball(), 0.02, engine=Torch())
     state = simulator.initial_state(at(0.06))
     points, calls = Contact.points, [0]
 

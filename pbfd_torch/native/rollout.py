@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.energy_momentum import Velocities
-from pbfd_torch.native.stepper import NativeStepper
+from pbfd_torch.native.stepper import NativeStepper, spread
 from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.solvers.per_world import mapped
@@ -26,23 +26,37 @@ def rolled_out(
     """See `Simulator.rollout`. Progress is told of each step when a few of them are done."""
     count = stepper.scene.step_count(controls, steps)
     recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, state)
+    batch = state.q.shape[:-1]
     most = max(1, AT_ONCE // max(1, state.q[..., 0].numel()))
     try:
         while recorder.steps < count:
             first = recorder.steps
             part = min(most, count - first)
-            held = None if controls is None else controls[first : first + part]
+            held = None if controls is None else spread(controls[first : first + part], batch)
             states, solution = stepper.run(state, held, part)
-            starts = mapped(_shifted, state, states)
-            recorder.record_several(states, solution, stepper.objective(starts, held))
+            told = _told(progress, first, part)
+            before = mapped(_shifted, state, states)
+            states, solution, before = (mapped(lambda x, kept=told: x[:kept], whole) for whole in (states, solution, before))
+            recorder.record_several(states, solution, stepper.objective(before, None if held is None else held[:told]))
+            if told < part:
+                break
             state = mapped(_last, states)
-            for k in range(part):
-                if progress is not None:
-                    progress(first + k + 1)
     except KeyboardInterrupt:
         if recorder.steps == 0:
             raise
     return recorder.finish()
+
+
+def _told(progress: Callable[[int], object] | None, first: int, part: int) -> int:
+    """Tells of steps that are done, and of how many it could before it was interrupted."""
+    if progress is None:
+        return part
+    for k in range(part):
+        try:
+            progress(first + k + 1)
+        except KeyboardInterrupt:
+            return k + 1
+    return part
 
 
 def _shifted(start: Tensor, ends: Tensor) -> Tensor:

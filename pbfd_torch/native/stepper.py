@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -92,15 +93,14 @@ class NativeStepper:
         return after, solution, Way(solution.q)
 
     def run(self, state: Velocities, controls: Tensor | None, steps: int) -> tuple[Velocities, Solution]:
-        """So many steps of all worlds under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all of them (None: zero): the
-        states after each, `[steps, *batch, ...]`, and how each was solved."""
+        """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
+        after each, `[steps, *batch, ...]`, and how each was solved."""
         batch = state.q.shape[:-1]
         if not batch:
-            alone = None if controls is None else controls[:, None]
-            return mapped(lambda x: x.squeeze(1), self.run(mapped(lambda x: x[None], state), alone, steps))
+            return mapped(lambda x: x.squeeze(1), self.run(mapped(lambda x: x[None], state), controls, steps))
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        controls = controls.expand(len(controls), *batch, controls.shape[-1])
+        controls = spread(controls, batch)
         with torch.no_grad():
             journey = Journey(state, controls, steps)
             self._core.go(journey, self._terms)
@@ -173,6 +173,12 @@ def _planned(eager: EagerStepper[Any]) -> Plan:
     if not isinstance(eager.solver, Fallbacks) or eager.solver.direct != Fallbacks().direct:
         raise NotCompiledError("the core does not know a solver other than the default one")
     return planned(eager)
+
+
+def spread(controls: Tensor, batch: Sequence[int]) -> Tensor:
+    """Controls `[steps, *, nu]`, given for all worlds or for some dimensions of the batch, as `[steps, *batch, nu]`."""
+    missing = len(batch) + 2 - controls.ndim
+    return controls.reshape(len(controls), *(1,) * missing, *controls.shape[1:]).expand(len(controls), *batch, controls.shape[-1])
 
 
 def _first(values: Tensor) -> Tensor:
