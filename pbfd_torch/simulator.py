@@ -15,6 +15,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linearization import Linearization, linearized
 from pbfd_torch.gradients.linked import Linked
+from pbfd_torch.gradients.parts import Carriers
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import Integrator, S
@@ -59,6 +60,7 @@ class Simulator(Generic[S]):
         self.gradients = gradients or Gradients()
         self._engine = engine
         self._made: tuple[Stepper[S], str, str] | None = None  # the stepper, its engine, and why it is no other; when asked for
+        self._carrying: Carriers | None = None  # when asked for
         if engine is not None:
             self._stepping()
 
@@ -67,6 +69,11 @@ class Simulator(Generic[S]):
             engine, reason = (self._engine, "") if self._engine is not None else chosen(self.eager)
             self._made = engine.stepper(self.eager), engine.name, reason
         return self._made
+
+    def _carriers(self) -> Carriers:
+        if self._carrying is None:
+            self._carrying = Carriers(self.eager)
+        return self._carrying
 
     @property
     def stepper(self) -> Stepper[S]:
@@ -122,12 +129,14 @@ class Simulator(Generic[S]):
         """The same simulator with steps [s] of another length `[]`, or of one for each world `[*batch]`."""
         other = copy.copy(self)
         other.eager, other._made = self.eager.sized(step_size), None
+        other._carrying = None
         return other
 
     def with_scene(self, scene: Scene) -> Self:
         """The same simulator of the same scene with other numbers: as a new one would be, but no device is asked for anything."""
         other = copy.copy(self)
         other.eager, other._made = self.eager.with_scene(scene), None
+        other._carrying = None
         return other
 
     def initial_state(self, q: Array | None = None, v: Array | None = None, control: Array | None = None) -> S:
@@ -155,11 +164,12 @@ class Simulator(Generic[S]):
 
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
         theorem (`gradients.implicit`); its values are the same to the bit."""
-        linked = Linked(self.eager, self.gradients)
         control = self.scene.controlled(control, state.q.shape[:-1])
-        if linked.carry(state, control):
-            advanced, made = linked.step(state, control)
-            return advanced, made.solution
+        if self._carriers().may_carry(state, control):
+            linked = Linked(self.eager, self.gradients)
+            if linked.carry(state, control):
+                advanced, made = linked.step(state, control)
+                return advanced, made.solution
         advanced, solution, _ = self.stepper.made(state, control)
         return advanced, solution
 
@@ -230,6 +240,11 @@ class AdaptiveSimulator(Simulator[S]):
         shortest: float | None = None,
     ) -> None:
         super().__init__(scene, dt, integrator, solver, halvings=0, engine=_Adaptive(accuracy, shortest))
+
+    @property
+    def engine_reason(self) -> str:
+        """See `Simulator`."""
+        return "steps that each world chooses the length of are made in PyTorch"
 
     def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but

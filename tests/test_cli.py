@@ -24,6 +24,7 @@ pbfd = pytest.fixture(caller)
 INFO_KEYS = {
     *("name", "nq", "nv", "nu", "mass_kg", "gravity_m_s2", "links", "joints"),
     *("actuators", "unlimited_actuators", "obstacles", "keyframes", "terms", "not_modelled", "native_library"),
+    *("engine", "engine_reason"),
 }
 
 

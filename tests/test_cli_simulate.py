@@ -11,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from pbfd_torch.cli.options import Choices, Friction, SolverChoice
+from pbfd_torch.native.library import library
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
@@ -54,6 +55,23 @@ def test_json_is_one_object_with_every_key(pbfd: Pbfd) -> None:
     assert data["metrics"]["mu"] == [0.1, 0.2, 0.3, 0.5, 0.8]
     assert max(map(abs, data["metrics"]["stop_distance_error"])) < 0.01
     assert max(data["metrics"]["final_speed_m_s"]) < 1e-9
+
+
+@pytest.mark.skipif(library() is None, reason="there is no compiled core")
+def test_engine(pbfd: Pbfd) -> None:
+    """--engine says what makes the steps; without it the compiled core does where it can, and the report says why not."""
+    short = ("--duration", "0.04", "--json")
+    compiled = pbfd("simulate", "hopper", *short).data
+    assert (compiled["engine"], compiled["engine_reason"]) == ("native", "")
+    defined = pbfd("simulate", "hopper", *short, "--engine", "torch").data
+    assert (defined["engine"], defined["engine_reason"]) == ("torch", "")
+    assert compiled["energy_end_J"] == pytest.approx(defined["energy_end_J"], rel=1e-6)
+    left = pbfd("simulate", "stack", *SHORT, "--json").data
+    assert left["engine"] == "torch"
+    assert "BodyContact" in left["engine_reason"]
+    assert "no compiled steps: the core does not know" in pbfd("simulate", "stack", "--engine", "native").words
+    for other in (("--accuracy", "1e-3"), ("--schedule", "asynchronous")):
+        assert f"must be torch with {other[0]}" in pbfd("simulate", "hopper", "--engine", "native", *other).words
 
 
 def test_table_names_the_scene_and_its_numbers(pbfd: Pbfd) -> None:

@@ -199,7 +199,15 @@ def test_info_names_the_library(pbfd: Pbfd) -> None:
     assert data == {"target": HERE[0], "lanes": {"float64": lanes, "float32": 2 * lanes}, "reason": ""}
 
 
+@needs_library
+def test_info_names_the_engine(pbfd: Pbfd) -> None:
+    assert "\nengine: native\n" in pbfd("info", "hopper").out
+    data = pbfd("info", "hopper", "--json").data
+    assert (data["engine"], data["engine_reason"]) == ("native", "")
+
+
 def test_info_says_why_there_is_none(pbfd: Pbfd, folder: Path) -> None:
     assert f"native library: none: {native.reason()}\n" in pbfd("info", "hopper").out
     data = pbfd("info", "hopper", "--json").data["native_library"]
     assert data == {"target": None, "lanes": {}, "reason": native.reason()}
+    assert f"\nengine: torch: {native.reason()}\n" in pbfd("info", "hopper").out

@@ -19,6 +19,7 @@ from pbfd_torch.bench.timing import Progress, timed, worst
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models.chains import LENGTH
 from pbfd_torch.models.setup import Setup
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -94,7 +95,7 @@ def tip(objective: BalanceObjective, q: Tensor) -> Tensor:
 
 def given_steps(setup: Setup, dt: float, steps: int) -> list[GivenStep]:
     """The steps of the default's rollout, with their reference solutions."""
-    simulator = Simulator(setup.scene, dt)
+    simulator = Simulator(setup.scene, dt, engine=Torch())
     reference = Descent(tolerance=REFERENCE_TOLERANCE)
     state: State = simulator.initial_state(setup.q, setup.v)
     given = []

@@ -22,6 +22,7 @@ from pbfd_torch.conventional.newton_euler import NewtonEuler
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models import chains
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
@@ -127,7 +128,7 @@ class Formulation:
 
 def _ours(integrator: Callable[[], Any]) -> Callable[[Scene, float], tuple[Stepper, Callable[[Any], Tensor]]]:
     def make(scene: Scene, dt: float) -> tuple[Stepper, Callable[[Any], Tensor]]:
-        simulator = Simulator(scene, dt, integrator())
+        simulator = Simulator(scene, dt, integrator(), engine=Torch())
         return simulator, lambda state: simulator.integrator.pose_rates(scene.articulation, state, simulator.step_size)
 
     return make

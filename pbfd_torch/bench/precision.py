@@ -21,6 +21,7 @@ from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
@@ -123,7 +124,7 @@ def step_count(duration: float, dt: float) -> int:
 def our_motion(case: Case, integrator: str, dt: float, duration: float) -> Motion:
     """From the scene's start, recorded."""
     setup = case.setup(case.tracked_worlds)
-    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator]())
+    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator](), engine=Torch())
     steps = step_count(duration, dt)
     controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
@@ -159,7 +160,7 @@ def starts(track: Track, worlds: int, first: int, count: int) -> tuple[Tensor, T
 def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: int) -> float:
     """Wall time per simulated second and world [ms]."""
     setup = case.setup(worlds)
-    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator]())
+    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator](), engine=Torch())
     groups = pieces if worlds == 1 else 1
     span = max(2, motion.rollout.steps // pieces)
     each = []

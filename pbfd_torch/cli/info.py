@@ -17,7 +17,9 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.errors import InputError
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES
+from pbfd_torch.models.robots import robot_setup
 from pbfd_torch.native.library import library, reason
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.joint_springs import Armature, JointDamping
 
 
@@ -29,7 +31,7 @@ def run(file: str, free_base: bool | None, as_json: bool) -> None:
             raise InputError(f"'{file}' is a scene made in code: give a URDF or MJCF file")
         file = str(shipped)
     robot = load_robot(file, free_base=free_base)
-    contents = describe(robot) | {"native_library": _native_library()}
+    contents = describe(robot) | {"native_library": _native_library()} | _engine(robot)
     if as_json:
         print(json.dumps(contents))
     else:
@@ -101,6 +103,13 @@ def _native_library() -> dict[str, Any]:
     return {"target": found and found.target, "lanes": lanes, "reason": reason()}
 
 
+def _engine(robot: Robot) -> dict[str, Any]:
+    """What makes the robot's steps, and why they are not compiled, if they are not."""
+    setup = robot_setup(robot)
+    simulator: Simulator[Any] = Simulator(setup.scene, setup.dt)
+    return {"engine": simulator.engine, "engine_reason": simulator.engine_reason}
+
+
 def _finite(value: torch.Tensor) -> float | None:
     return float(value) if bool(torch.isfinite(value)) else None
 
@@ -159,4 +168,5 @@ def _print(contents: dict[str, Any]) -> None:
         "native library:",
         f"{native['target']}, {native['lanes']['float64']} lanes of float64" if native["target"] else f"none: {native['reason']}",
     )
+    print("engine:", contents["engine"] + (f": {contents['engine_reason']}" if contents["engine_reason"] else ""))
     print("not modelled:" + ("".join(f"\n  {line}" for line in contents["not_modelled"]) or " nothing"))

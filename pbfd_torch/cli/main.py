@@ -17,7 +17,18 @@ from pbfd_torch.cli.bench_soak import soak
 from pbfd_torch.cli.bench_solvers import solvers
 from pbfd_torch.cli.evaluate import evaluate
 from pbfd_torch.cli.optimize import optimize
-from pbfd_torch.cli.options import Choices, Device, Dtype, Friction, Integrator, Schedule, SolverChoice, load_setup, use_threads
+from pbfd_torch.cli.options import (
+    Choices,
+    Device,
+    Dtype,
+    EngineChoice,
+    Friction,
+    Integrator,
+    Schedule,
+    SolverChoice,
+    load_setup,
+    use_threads,
+)
 from pbfd_torch.cli.ranges import ACCURACY, DURATION, PROCESSES, SEED, STEP, THREADS, WORLDS
 from pbfd_torch.cli.train import train
 from pbfd_torch.cli.view import view
@@ -60,6 +71,10 @@ def simulate(
     solver: Annotated[
         SolverChoice, typer.Option(help="Solver; direct: without fallbacks; damped, lm, lbfgs: on ½‖r‖², as the paper has them.")
     ] = SolverChoice.JTJ_LM,
+    engine: Annotated[
+        EngineChoice | None,
+        typer.Option(help="What makes the steps; default: the compiled core where it can, else torch."),
+    ] = None,
     friction: Annotated[Friction | None, typer.Option(help="Friction law; default: the scene's (Coulomb).")] = None,
     dtype: Annotated[Dtype, typer.Option(help="Floating-point type.")] = Dtype.FLOAT64,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.CPU,
@@ -86,7 +101,7 @@ def simulate(
 
     use_threads(threads)
     free_base = None if fixed_base is None else not fixed_base
-    choices = Choices(integrator, solver, friction, dtype, device, seed, free_base, keyframe, schedule, workers, accuracy)
+    choices = Choices(integrator, solver, friction, dtype, device, seed, free_base, keyframe, schedule, workers, accuracy, engine)
     raise typer.Exit(run(load_setup(scene, worlds, choices), choices, duration, dt, out, as_json))
 
 

@@ -15,6 +15,7 @@ import torch
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES, Setup, file_setup
+from pbfd_torch.native.engine import Engine, Native, Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.descent import Descent
@@ -51,6 +52,11 @@ class Schedule(enum.StrEnum):
     ASYNCHRONOUS = "asynchronous"
 
 
+class EngineChoice(enum.StrEnum):
+    NATIVE = "native"
+    TORCH = "torch"
+
+
 class Friction(enum.StrEnum):
     COULOMB = "coulomb"
     ANCHORED = "anchored"
@@ -81,6 +87,8 @@ _SOLVERS: dict[SolverChoice, Callable[[], Solver]] = {
     SolverChoice.LBFGS: lambda: OnSquares(lbfgs()),
 }
 
+_ENGINES: dict[EngineChoice | None, Engine | None] = {None: None, EngineChoice.NATIVE: Native(), EngineChoice.TORCH: Torch()}
+
 
 @dataclass(frozen=True)
 class Choices:
@@ -97,10 +105,15 @@ class Choices:
     schedule: Schedule = Schedule.LOCK_STEP
     workers: int = 1
     accuracy: float | None = None
+    engine: EngineChoice | None = None
 
     def __post_init__(self) -> None:
         if self.accuracy is not None and self.schedule is Schedule.ASYNCHRONOUS:
             raise InputError("--accuracy lets every world go at its own pace already: leave out --schedule asynchronous")
+        if self.engine is EngineChoice.NATIVE and self.accuracy is not None:
+            raise InputError("--engine is native: must be torch with --accuracy")
+        if self.engine is EngineChoice.NATIVE and self.schedule is Schedule.ASYNCHRONOUS:
+            raise InputError("--engine is native: must be torch with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.workers > 1:
             raise InputError(f"--workers is {self.workers}: must be 1 with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
@@ -110,10 +123,10 @@ class Choices:
         return _SOLVERS[self.solver]()
 
     def make_simulator(self, scene: Scene, dt: float) -> Simulator[Any]:
-        """Raises `InputError` for a Δt or an accuracy out of range."""
+        """Raises `InputError` for a Δt or an accuracy out of range, and for an engine that cannot."""
         integrator, solver = INTEGRATORS[self.integrator.value](), self.make_solver()
         if self.accuracy is None:
-            return Simulator(scene, dt, integrator, solver)
+            return Simulator(scene, dt, integrator, solver, engine=_ENGINES[self.engine])
         return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver)
 
 

@@ -39,6 +39,8 @@ class Result:
     rollout: Rollout
     choices: Choices
     wall_s: float
+    engine: str
+    engine_reason: str
 
     def summary(self) -> dict[str, Any]:
         """The numbers of the report; energies and the centre of mass are world 0's, extremes are over all worlds."""
@@ -57,6 +59,8 @@ class Result:
             "substeps_mean": float(r.substeps.sum(0).to(torch.float64).mean()),
             "integrator": self.choices.integrator.value,
             "solver": self.choices.solver.value,
+            "engine": self.engine,
+            "engine_reason": self.engine_reason,
             "dtype": self.choices.dtype.value,
             "device": self.choices.device.value,
             "wall_s": self.wall_s,
@@ -134,7 +138,9 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     wall = time.perf_counter() - started
     if rollout.steps < steps:
         print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)
-    return Result(setup, rollout, choices, wall)
+    if choices.schedule is Schedule.ASYNCHRONOUS:
+        return Result(setup, rollout, choices, wall, "torch", "asynchronous rollouts are made in PyTorch")
+    return Result(setup, rollout, choices, wall, simulator.engine, simulator.engine_reason)
 
 
 def print_summary(result: Result, out: Path | None) -> None:
