@@ -27,7 +27,7 @@ BLOCKS = 4  # for each thread: some worlds take longer than others
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates")),
+        *((name, ctypes.c_int) for name in ("bytes", "each", "nodes", "nq", "nv", "nu", "candidates")),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -109,10 +109,11 @@ class Core:
     def __init__(self, library: Library, plan: Plan, threads: int) -> None:
         self.plan, self._threads = plan, threads
         self._functions = library.functions
-        self._plan = _Plan(plan.real.element_size(), *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        each = plan.real.ndim > 1
+        self._plan = _Plan(plan.real.element_size(), each, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
-        if wanted != (plan.whole.numel(), plan.real.numel()):
-            raise ValueError(f"the plan has {plan.whole.numel()} and {plan.real.numel()} numbers: the core wants {wanted}")
+        if wanted != (len(plan.whole), plan.real.shape[-1]):
+            raise ValueError(f"the plan has {len(plan.whole)} and {plan.real.shape[-1]} numbers: the core wants {wanted}")
         self._room = self._asked("pbfd_room") + ALIGNMENT
         self._rooms: list[Tensor] = []  # that no call is in
         self._lanes = library.lanes(plan.real.dtype)

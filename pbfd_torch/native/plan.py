@@ -37,7 +37,8 @@ def _unknown(what: str) -> NotCompiledError:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, candidates. whole: `int32`. real: of the scene's dtype."""
+    """sizes: nodes, nq, nv, nu, candidates. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or `[worlds, n]` where worlds
+    have numbers of their own."""
 
     sizes: tuple[int, int, int, int, int]
     whole: Tensor

@@ -16,11 +16,11 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
 
-template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class V, class N> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
-  const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   Arena<V> arena{static_cast<V*>(room)};
-  Machine<V, T> machine(plan, arena);
+  Scenery<V, N> scenery(sizes(p), p->whole, static_cast<const T*>(p->real), arena);
+  Machine<V, N> machine(scenery, arena);
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
   const Journey<T> journey{
@@ -34,10 +34,16 @@ template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s,
 
 // A single world is spared the work of lanes that nobody needs.
 template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  if (s->last - s->first == 1)
-    energy_momentum<T>(p, s, room);
-  else
-    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>>(p, s, room);
+  using V = Lanes<T, register_bytes / int(sizeof(T))>;
+  if (s->last - s->first == 1) {
+    pbfd_plan own = *p;
+    if (p->each) own.real = static_cast<const T*>(p->real) + long(s->first) * Plan<T>::real_numbers(sizes(p));
+    energy_momentum<T, T>(&own, s, room);
+  } else if (p->each) {
+    energy_momentum<V, V>(p, s, room);
+  } else {
+    energy_momentum<V, T>(p, s, room);
+  }
 }
 
 }  // namespace
@@ -48,9 +54,11 @@ long pbfd_real_numbers(const pbfd_plan* p) { return Plan<double>::real_numbers(s
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
-  const int wide = Machine<Lanes<double, register_bytes / 8>, double>::room(sizes(p));
-  const int narrow = Machine<Lanes<float, register_bytes / 4>, float>::room(sizes(p));
-  return long(register_bytes) * (wide > narrow ? wide : narrow);
+  using Wide = Lanes<double, register_bytes / 8>;
+  using Narrow = Lanes<float, register_bytes / 4>;
+  const int wide = Machine<Wide, Wide>::room(sizes(p)), narrow = Machine<Narrow, Narrow>::room(sizes(p));
+  const int numbers = p->each ? Plan<Wide>::real_numbers(sizes(p)) : 0;
+  return long(register_bytes) * (numbers + (wide > narrow ? wide : narrow));
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {

@@ -2,6 +2,7 @@
 // or another world, at once (the paper's Fig. 3).
 #pragma once
 #include "energy_momentum.h"
+#include "scenery.h"
 #include "standstill.h"
 
 namespace pbfd {
@@ -30,13 +31,14 @@ template <class V, class N> struct Machine {
   EnergyMomentum<V, N> scheme;
   Velocities<V> before, after;
   V *q, *guess, *velocity, *room_to_begin;
+  Scenery<V, N>& scenery;
 
   static int room(Sizes s) {
     return Newton<V, N>::room(s) + EnergyMomentum<V, N>::room(s) + 11 * s.nv + 2 * s.nq + 18 * s.nodes;
   }
-  Machine(const Plan<N>& scene, Arena<V>& arena)
-      : plan(scene), newton(scene, arena), scheme(scene, arena), before(Velocities<V>::in(arena, scene)),
-        after(Velocities<V>::in(arena, scene)) {
+  Machine(Scenery<V, N>& scenes, Arena<V>& arena)
+      : plan(scenes.plan), newton(plan, arena), scheme(plan, arena), before(Velocities<V>::in(arena, plan)),
+        after(Velocities<V>::in(arena, plan)), scenery(scenes) {
     q = arena.take(plan.nq), guess = arena.take(plan.nq), velocity = arena.take(plan.nv);
     room_to_begin = arena.take(18 * plan.nodes);
   }
@@ -76,7 +78,7 @@ template <class V, class N> struct Machine {
     const bool found = next < end;
     const int from = found ? next++ : end - 1;
     world[i] = found ? from : -1, step[i] = journey->made[from];
-    load(i, from), steer(i, from);
+    load(i, from), steer(i, from), scenery.enter(i, from);
     return found;
   }
 
