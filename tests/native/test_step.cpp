@@ -46,7 +46,7 @@ struct Worlds {
 // Worlds `first` … of all, each dropped from its own height and set spinning.
 Worlds dropped(int first, int count) {
   const std::vector<double> real = numbers();
-  const pbfd_plan plan{8, 1, NQ, NV, 0, 1, whole, real.data()};
+  const pbfd_plan plan{8, 0, 1, NQ, NV, 0, 1, whole, real.data()};
   CHECK(pbfd_whole_numbers(&plan) == 5);
   CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);
