@@ -38,10 +38,10 @@ template <class V, class N> struct EnergyMomentum {
   // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it.
   M advance(Balance<V, N>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
     const int n = plan.nv;
-    const V h = b.dt, zero(0), half(0.5);
+    const V h = b.dt, per = V(1) / h, twice = per + per, zero(0), half(0.5);
     split_forces(b, q);
     difference(plan, b.q_start, q, after.average);
-    for (int i = 0; i < n; i++) after.average[i] = after.average[i] / h;
+    for (int i = 0; i < n; i++) after.average[i] = per * after.average[i];
 
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions
     motion_axes(plan, b.start, b.chord_axes);
@@ -50,9 +50,9 @@ template <class V, class N> struct EnergyMomentum {
       const V* rate = rates + 12 * k;
       V next[12];
       for (int i = 0; i < 9; i++)
-        next[i] = fma(V(2), (b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i]) / h, -rate[i]);
+        next[i] = fma(twice, b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i], -rate[i]);
       for (int i = 0; i < 3; i++)
-        next[9 + i] = fma(V(2), (b.now.position[3 * k + i] - b.start.position[3 * k + i]) / h, -rate[9 + i]);
+        next[9 + i] = fma(twice, b.now.position[3 * k + i] - b.start.position[3 * k + i], -rate[9 + i]);
       pushed(k, b.now, next, sums[k]);
     }
     sum_up();

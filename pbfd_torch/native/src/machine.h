@@ -52,7 +52,7 @@ template <class V, class N> struct Machine {
       set_out(fresh);
       do newton.pass();
       while (!enough(at, next < last));
-      newton.balance.evaluate(newton.trial);  // running lanes look again; the others are where their step has ended
+      if (!newton.settled) newton.balance.evaluate(newton.trial);
       const M refused = scheme.advance(newton.balance, newton.q, before, after);
       M deep, far;
       look_for_hazards(deep, far);
