@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -47,12 +47,12 @@ class Plan:
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a stepper's scene. Raises `NotCompiledError` naming what the core does not know."""
-    a = stepper.articulation
     _require_covered(stepper)
-    known = _Terms(stepper)
+    a = _aligned(stepper.articulation)
+    known = _Terms(stepper, a)
     t = a.topology
     kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in zip(t.joint_sizes, t.joint_is_hinge, strict=True)]
-    whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
+    whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start] + _plain(a) + _above(a)
     act, candidates = known.actuators, known.candidates
     nu = 0
     driven: list[Tensor] = []
@@ -96,8 +96,61 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
         raise _unknown("a free joint that does not move along the world's axes")
 
 
+def _aligned(a: Articulation) -> Articulation:
+    """The same tree with nodes turned by constants, so that hinges turn about the node's z, and slides move along it."""
+    t, eye = a.topology, torch.eye(3, dtype=a.dtype)
+    z = eye[2]
+    frames = a.joint_frame.clone()
+    turns = [eye]  # of the world, and of each node
+    for j, (size, parent) in enumerate(zip(t.joint_sizes, t.joint_parent, strict=True)):
+        frame = _pose(turns[parent]).mT @ frames[j]
+        as_parent = frame[:3, :3].mT
+        frames[j] = frame
+        if size != (1, 1):
+            turns.append(eye)
+        elif torch.allclose(as_parent @ z, a.joint_axis[j], rtol=0.0, atol=4.0 * torch.finfo(a.dtype).eps):
+            turns.append(as_parent)
+            frames[j, :3, :3] = eye
+        else:
+            turns.append(_turning(a.joint_axis[j]))
+            frames[j, :3, :3] = frame[:3, :3] @ turns[-1]
+    links = torch.stack([_pose(turns[node]).mT @ frame for node, frame in zip(t.link_node, a.link_frame, strict=True)])
+    return replace(a, joint_frame=frames, joint_axis=z.expand(t.njoint, 3), link_frame=links)
+
+
+def _pose(rotation: Tensor) -> Tensor:
+    pose = torch.eye(4, dtype=rotation.dtype)
+    pose[:3, :3] = rotation
+    return pose
+
+
+def _turning(axis: Tensor) -> Tensor:
+    """A rotation that takes z to a unit vector; along x, y and z without rounding."""
+    x = torch.linalg.cross(torch.eye(3, dtype=axis.dtype)[int(axis.abs().argmin())], axis)
+    x = x / x.norm()
+    return torch.stack((x, torch.linalg.cross(axis, x), axis), dim=-1)
+
+
+def _plain(a: Articulation) -> list[int]:
+    """Which nodes' frames are turned as their parents'."""
+    eye = torch.eye(3, dtype=a.dtype)
+    return [int(torch.equal(frame[:3, :3], eye)) for frame in a.joint_frame]
+
+
+def _above(a: Articulation) -> list[int]:
+    """How many dofs each dof rides on, and which, the nearest first: `nv` numbers of each."""
+    t = a.topology
+    rows: list[list[int]] = []
+    for first, (_, size), parent in zip(t.v_start, t.joint_sizes, t.joint_parent, strict=True):
+        last = t.v_start[parent - 1] + t.joint_sizes[parent - 1][1] - 1
+        carriers = [last, *rows[last]] if parent else []
+        rows += [[*range(first, first + i)] + carriers for i in range(size)]
+    return [len(row) for row in rows] + [i for row in rows for i in row + [0] * (t.nv - len(row))]
+
+
 def _nodes(a: Articulation) -> Sequence[Tensor]:
-    """Frames, axes and references of the joints, and masses, centres and second moments of all links that ride on each."""
+    """Frames and references of the joints, masses, centres and second moments of all links that ride on each, and the mass that
+    it moves."""
     t = a.topology
     ridden = torch.zeros(t.njoint, 4, 4, dtype=a.dtype)
     for link, node in enumerate(t.link_node):
@@ -106,7 +159,11 @@ def _nodes(a: Articulation) -> Sequence[Tensor]:
     mass, first = ridden[:, 3, 3], ridden[:, :3, 3]
     center = torch.where(mass[:, None] > 0, first / torch.where(mass > 0, mass, 1.0)[:, None], 0.0)
     second = ridden[:, :3, :3] - mass[:, None, None] * center[:, :, None] * center[:, None, :]
-    return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_axis, a.joint_ref, mass, center, second
+    carried = mass.clone()
+    for j in range(t.njoint - 1, 0, -1):
+        if t.joint_parent[j] > 0:
+            carried[t.joint_parent[j] - 1] += carried[j]
+    return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_ref, mass, center, second, carried
 
 
 @dataclass
@@ -126,8 +183,7 @@ class _Candidates:
 class _Terms:
     """The numbers of a stepper's terms, of those that are there; the others do nothing."""
 
-    def __init__(self, stepper: EagerStepper[Any]) -> None:
-        a = stepper.articulation
+    def __init__(self, stepper: EagerStepper[Any], a: Articulation) -> None:
         zero = torch.zeros(a.nv, dtype=a.dtype)
         self.share = zero + 0.5
         self.spring = self.damping = self.armature = self.dry = self.limit = zero

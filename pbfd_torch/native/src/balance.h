@@ -3,8 +3,8 @@
 //
 // For a dof i at or above dof j, with sums over all that j's joint moves: loads at the end of the step give
 //   r_i = s_i · W,  J_ij = s_iᵀ A s_j + s_iᵀ B s_j,  J_ji = s_jᵀ A s_i + s_iᵀ B s_j;
-// inertia on the chord, s̄ the twists there and w its share,
-//   r_i = s̄_i · W,  ∂r_i/∂θ_j = s̄_iᵀ (A + w B) s_j + w s_j · Y_i.
+// inertia on the chord, s̄ the twists there, w its share and A with what bends them (inertia.h),
+//   r_i = s̄_i · W,  ∂r_i/∂θ_j = s̄_iᵀ A s_j + w s_j · Y_i.
 #pragma once
 #include "contact.h"
 #include "inertia.h"
@@ -12,217 +12,222 @@
 
 namespace pbfd {
 
-template <class V, class N> struct Balance {
-  const Plan<N>& plan;
+template <class V, class N, int D = 3> struct Balance {
+  static constexpr int T = turns(D), S = T + D;  // a twist (ω, v)
+  const Plan<N, D>& plan;
   // what is fixed in a step
   Poses<V> start, target;
-  V *q_start, *q_target, *control;
+  V *start_axes, *q_start, *q_target, *control;
   V dt, weight, share;  // share = 1: inertia works at the end of the step
-  bool on_chord;
+  Hold<V, D>* holds;
+  V* arms;  // κ Σ m p̃ of all that a node moves
   // at the configuration
-  Poses<V> now, chord;
-  V *axes, *chord_axes, *residual, *matrix, *turns;
-  Pull<V>* pulls;
+  Poses<V> now;
+  V *axes, *chord_axes, *chord, *residual, *slopes, *matrix, *turns_;
+  Pull<V, D>* pulls;
   Push<V>* pushes;
   bool* turned;
 
+  template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
-    const int loads = int((sizeof(Pull<V>) + sizeof(Push<V>)) / sizeof(V)) + 3;
-    return s.nodes * (48 + 3 + loads) + 2 * s.nq + s.nu + 13 * s.nv + s.nv * s.nv;
+    return s.nodes * (3 * (D * D + D) + 2 * D + 3) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
+           in_registers<Push<V>>(s.nodes) + in_registers<bool>(s.nodes) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
   }
+  template <class X> static X* taken(Arena<V>& arena, int count) { return reinterpret_cast<X*>(arena.take(in_registers<X>(count))); }
 
-  Balance(const Plan<N>& scene, Arena<V>& arena) : plan(scene) {
-    start = Poses<V>::in(arena, plan), target = Poses<V>::in(arena, plan);
-    now = Poses<V>::in(arena, plan), chord = Poses<V>::in(arena, plan);
+  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene) {
+    start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
+    now = Poses<V>::template in<D>(arena, plan);
+    start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    axes = arena.take(6 * plan.nv), chord_axes = arena.take(6 * plan.nv);
-    residual = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv), turns = arena.take(3 * plan.nodes);
-    pulls = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
-    pushes = reinterpret_cast<Push<V>*>(arena.take(plan.nodes * int((sizeof(Push<V>) + sizeof(V) - 1) / sizeof(V))));
-    turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
+    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), turns_ = arena.take(3 * plan.nodes);
+    residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
+    holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
+    pushes = taken<Push<V>>(arena, plan.nodes), turned = taken<bool>(arena, plan.nodes);
+    for (int i = 0; i < plan.nv * plan.nv; i++) matrix[i] = V(0);  // dofs on different branches stay uncoupled
   }
 
-  // All of it at q; the matrix by `assemble`.
+  // The start and its axes, the target, κ and w are known.
+  void begin() {
+    for (int k = 0; k < plan.nodes; k++)
+      if (heavy(k)) hold(plan, k, weight, share, start, target, holds[k]);
+    carry();
+  }
+
+  // r at q; J by `assemble`.
   void evaluate(const V* q) {
-    place(plan, q, now);
-    motion_axes(plan, now, axes);
-    if (on_chord) {
-      for (int i = 0; i < 9 * plan.nodes; i++)
-        chord.rotation[i] = fma(share, now.rotation[i] - start.rotation[i], start.rotation[i]);
-      for (int i = 0; i < 3 * plan.nodes; i++)
-        chord.position[i] = fma(share, now.position[i] - start.position[i], start.position[i]);
-      motion_axes(plan, chord, chord_axes);
-    }
+    place(plan, q, now, axes);
     for (int k = 0; k < plan.nodes; k++) {
+      to_chord(k);
       pushes[k].any = false;
-      if (any(V(plan.mass[k]) > V(0)))
-        pull(plan, k, weight, share, start, target, now, pulls[k]);
-      else
-        pulls[k].clear();  // a joint that only leads to others
     }
-    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns, turned);
+    pull_all();
+    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns_, turned);
     for (int k = plan.nodes - 1; k > 0; k--)
-      if (plan.parent[k] >= 0) {
-        pulls[plan.parent[k]].add(pulls[k]);
-        if (pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
-      }
-    for (int i = 0; i < plan.nv; i++) residual[i] = V(0);
-    joint_loads(plan, steps(), q, residual, static_cast<V*>(nullptr));
+      if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
+    for (int i = 0; i < plan.nv; i++) residual[i] = slopes[i] = V(0);
+    joint_loads(plan, steps(), q, residual, slopes);
     for (int k = 0; k < plan.nodes; k++)
       for (int j = plan.v[k]; j < plan.v[k] + freedoms(plan.kind[k]); j++) {
-        residual[j] += worked(inertial_axis(j), pulls[k].moment, pulls[k].force);
-        if (pushes[k].any) residual[j] += worked(axes + 6 * j, pushes[k].moment, pushes[k].force);
+        const V* s = chord_axes + S * j;
+        residual[j] += dot<T>(s, pulls[k].torque) + dot<D>(s + T, pulls[k].force);
+        if (pushes[k].any) residual[j] += worked(axes + S * j, pushes[k].moment, pushes[k].force);
       }
   }
 
   // J, or with `curved` false the stiffness: J without how the axes turn under the forces.
   void assemble(const V* q, bool curved) {
-    const int n = plan.nv;
-    for (int i = 0; i < n * n; i++) matrix[i] = V(0);
+    if (!curved) let_go(now), pull_all();
     for (int k = 0; k < plan.nodes; k++) {
-      const Pull<V>& pull = pulls[k];
+      const Pull<V, D>& pull = pulls[k];
       const Push<V>& push = pushes[k];
+      const V mass = weight * V(plan.carried[k]), *arm = arms + D * k;
       const int first = plan.v[k], last = first + freedoms(plan.kind[k]);
+      for (int i = first; i < last; i++)
+        for (int j = first; j < last; j++) matrix[plan.nv * i + j] = i == j ? slopes[j] : V(0);
+      V bends[T * T] = {}, torque[T] = {};
+      if (push.any && curved) resistance<D>(push.moment, bends);
+      if (curved) {  // about the joint
+        lever<D>(chord + D * k, pull.force, torque);
+        for (int i = 0; i < T; i++) torque[i] = pull.torque[i] - torque[i];
+      }
       for (int j = first; j < last; j++) {
-        const V *s = axes + 6 * j, *s_chord = inertial_axis(j);
-        V below[6], above[6], bent[3] = {};  // A s_j, Aᵀ s̄_j, and what turns the axes above under the forces
-        answer(pull, s, curved && on_chord, below);
-        answer_above(pull, s_chord, curved && on_chord, above);
-        V below_push[6] = {}, above_push[6] = {};
-        if (push.any)
-          for (int a = 0; a < 6; a++) {
-            below_push[a] = above_push[a] = V(0);
-            for (int b = 0; b < 6; b++) {
-              below_push[a] = fma(push.stiffness[6 * a + b], s[b], below_push[a]);
-              above_push[a] = fma(push.stiffness[6 * b + a], s[b], above_push[a]);
-            }
-          }
-        V turning[6] = {};
-        if (curved && on_chord) turn_axis(k, j, turning);
-        if (curved) bend(k, s, bent);
-        for (int up = k; up >= 0; up = plan.parent[up]) {
-          const int from = plan.v[up], to = up == k ? last : from + freedoms(plan.kind[up]);
-          for (int i = from; i < to; i++) {
-            const V *t = axes + 6 * i, *t_chord = inertial_axis(i);
-            V upper = along(t_chord, below);
-            if (push.any) upper += along(t, below_push);
-            matrix[i * n + j] += upper;
-            if (up == k) continue;  // the row of j itself comes with i and j exchanged
-            V lower = along(t, above);
-            if (push.any) lower += along(t, above_push);
-            if (curved) {
-              const V carried = dot(t, bent);
-              matrix[i * n + j] += carried;
-              lower += carried;
-              if (on_chord) lower = fma(share, along(t, turning), lower);
-            }
-            matrix[j * n + i] += lower;
+        // what works on the axes above: of inertia on those on the chord, of the rest on those at the end; what j's own axis feels
+        // of a motion above; and how it is turned by it
+        const V *s = axes + S * j, *s_chord = chord_axes + S * j;
+        V inertial[S], felt[S], turning[S] = {}, pressed[S] = {}, bent[T] = {};
+        answer(pull, mass, arm, s, inertial);
+        answer_above(pull, mass, arm, s_chord, felt);
+        if (curved) {
+          turn_axis(k, j, torque, turning);
+          for (int a = 0; a < S; a++) felt[a] += turning[a];
+        }
+        if (push.any) {
+          times<S>(push.stiffness, s, pressed);
+          V from_above[S];
+          transposed_times<S>(push.stiffness, s, from_above);
+          for (int a = 0; a < S; a++) felt[a] += from_above[a];
+          if (curved) {
+            bend(bends, push.force, s, bent);
+            for (int a = 0; a < T; a++) felt[a] += bent[a];
           }
         }
-        if (curved) within(k, j, first, last, bent, turning);
+        for (int i = first; i < last; i++) {
+          V& entry = matrix[plan.nv * i + j];
+          entry += along(chord_axes + S * i, inertial);
+          if (push.any) entry += along(axes + S * i, pressed);
+        }
+        if (push.any && curved)
+          for (int a = 0; a < T; a++) pressed[a] += bent[a];
+        for (int a = j - first; a < plan.depth[j]; a++) {
+          const int i = plan.above[plan.nv * j + a];
+          V& entry = matrix[plan.nv * i + j];
+          entry = along(chord_axes + S * i, inertial);
+          if (push.any) entry += along(axes + S * i, pressed);
+          matrix[plan.nv * j + i] = along(axes + S * i, felt);
+        }
+        if (curved) within(k, j, push.any ? bent : nullptr, turning);
+      }
+      if (plan.kind[k] == BALL || plan.kind[k] == FREE) {
+        if (curved) lose_half_the_torque(k);
+        turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
       }
     }
-    if (curved && on_chord) lose_half_the_torque();
-    joint_loads(plan, steps(), q, static_cast<V*>(nullptr), matrix);
+    if (!curved) let_go(target), pull_all();
   }
 
   JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }
 
  private:
-  const V* inertial_axis(int j) const { return (on_chord ? chord_axes : axes) + 6 * j; }
-  static V along(const V* a, const V* b) { return dot(a, b) + dot(a + 3, b + 3); }
+  bool heavy(int k) const { return any(plan.mass[k] > N(0)); }
+  static V along(const V* a, const V* b) { return dot<S>(a, b); }
 
-  // A s, or (A + w B) s where the points move on the chord.
-  void answer(const Pull<V>& p, const V* s, bool moved, V* out) const {
-    p.answer(s, out);
-    if (!moved) return;
-    const V *w = s, *v = s + 3;
-    V torque[3], beside[3];
-    const V whole = trace(p.at_end);
-    transposed_times(p.at_end, w, torque);
-    cross(p.force, v, beside);
-    for (int i = 0; i < 3; i++) out[i] = fma(share, torque[i] - whole * w[i] - beside[i], out[i]);
+  // Masses are held at places between the start and `other`.
+  void let_go(Poses<V> other) {
+    for (int k = 0; k < plan.nodes; k++)
+      if (heavy(k)) hold_by(plan, k, weight, share, start, other, holds[k]);
+    carry();
+  }
+  void carry() {
+    for (int k = 0; k < plan.nodes; k++)
+      for (int i = 0; i < D; i++) arms[D * k + i] = heavy(k) ? holds[k].held[i] : V(0);
+    for (int k = plan.nodes - 1; k > 0; k--)
+      for (int i = 0; plan.parent[k] >= 0 && i < D; i++) arms[D * plan.parent[k] + i] += arms[D * k + i];
   }
 
-  // Aᵀ s̄, or (A + w B)ᵀ s̄.
-  void answer_above(const Pull<V>& p, const V* s, bool moved, V* out) const {
-    const V *w = s, *v = s + 3, sum = trace(p.second);
-    transposed_times(p.second, w, out);
-    for (int i = 0; i < 3; i++) out[i] = fma(sum, w[i], -out[i]), out[3 + i] = p.mass * v[i];
-    add_cross(p.first, v, out);
-    add_cross(w, p.on_chord, out + 3);
-    if (!moved) return;
-    V torque[3], beside[3];
-    const V whole = trace(p.at_end);
-    times(p.at_end, w, torque);
-    cross(p.force, w, beside);
-    for (int i = 0; i < 3; i++) {
-      out[i] = fma(share, torque[i] - whole * w[i], out[i]);
-      out[3 + i] = fma(share, beside[i], out[3 + i]);
+  void pull_all() {
+    for (int k = 0; k < plan.nodes; k++) {
+      pulls[k].any = heavy(k);  // a joint may only lead to others
+      if (heavy(k)) pull(plan, k, weight, share, holds[k], now, pulls[k]);
+    }
+    for (int k = plan.nodes - 1; k > 0; k--)
+      if (plan.parent[k] >= 0) pulls[plan.parent[k]].add(pulls[k]);
+  }
+
+  // Where joint k is on the chord, and the axes that ride on it there, where rotations have shrunk.
+  void to_chord(int k) {
+    V* p = chord + D * k;
+    for (int i = 0; i < D; i++) p[i] = blended(share, start.position[D * k + i], now.position[D * k + i]);
+    const int first = plan.v[k], turning = first + straight(plan.kind[k]), last = first + freedoms(plan.kind[k]);
+    for (int j = first; j < last; j++) {
+      const V *s0 = start_axes + S * j, *s1 = axes + S * j;
+      V* s = chord_axes + S * j;
+      for (int a = 0; a < (j < turning ? S : T); a++) s[a] = blended(share, s0[a], s1[a]);
+      if (j >= turning) about<D>(p, s, s + T);
     }
   }
 
-  // Bᵀ of loads at the end of the step: Gᵀ ω − tr G ω − g × v.
-  void bend(int k, const V* s, V* out) const {
-    for (int i = 0; i < 3; i++) out[i] = V(0);
-    if (!on_chord) add_bend(pulls[k].moment, pulls[k].force, s, out);
-    if (pushes[k].any) add_bend(pushes[k].moment, pushes[k].force, s, out);
-  }
-  static void add_bend(const V* moment, const V* force, const V* s, V* out) {
-    V turned_[3], beside[3];
-    const V sum = trace(moment);
-    transposed_times(moment, s, turned_);
-    cross(force, s + 3, beside);
-    for (int i = 0; i < 3; i++) out[i] += turned_[i] - sum * s[i] - beside[i];
+  // B of contacts, what turns the axes above: Gᵀ ω − tr G ω − g × v.
+  static void bend(const V* bends, const V* force, const V* s, V* out) {
+    V beside[T];
+    transposed_times<T>(bends, s, out);
+    lever<D>(force, s + T, beside);
+    for (int i = 0; i < T; i++) out[i] = -(out[i] + beside[i]);
   }
 
-  // Y_j: what turning the axis of j on the chord does, by the twists that move it.
-  void turn_axis(int k, int j, V* out) const {
-    const V *s = axes + 6 * j, *at = now.position + 3 * k, *middle = chord.position + 3 * k, *force = pulls[k].force;
-    const V* moment = pulls[k].moment;
-    V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
-    V beside[3], slide[3], pulled[3];
-    cross(middle, force, beside);
-    for (int i = 0; i < 3; i++) torque[i] -= beside[i];
-    cross(at, s, beside);
-    for (int i = 0; i < 3; i++) slide[i] = s[3 + i] - beside[i];
-    cross(force, chord_axes + 6 * j, pulled);
-    cross(s, torque, out);
-    add_cross(slide, force, out);
-    cross(at, pulled, beside);
-    for (int i = 0; i < 3; i++) out[i] -= beside[i], out[3 + i] = -pulled[i];
+  // w Y_j: what turning the axis of j on the chord does, by the twists that move it; `torque` about joint k there.
+  void turn_axis(int k, int j, const V* torque, V* out) const {
+    const V *s = axes + S * j, *force = pulls[k].force;
+    for (int a = 0; a < S; a++) out[a] = V(0);
+    if (plan.kind[k] == SLIDE) {
+      lever<D>(s + T, force, out);
+    } else if (j >= plan.v[k] + straight(plan.kind[k])) {
+      swing<D>(chord_axes + S * j, force, out + T);
+      lever<D>(now.position + D * k, out + T, out);
+      if constexpr (D == 3) add_cross(s, torque, out);
+    }
+    for (int a = 0; a < S; a++) out[a] *= share;
   }
 
   // Within one joint: its own axes turn too, those of a free joint's translation do not.
-  void within(int k, int j, int first, int last, const V* bent, const V* turning) {
-    const int n = plan.nv, rotation = plan.kind[k] == FREE ? first + 3 : first;
+  void within(int k, int j, const V* bent, const V* turning) {
+    const int n = plan.nv, first = plan.v[k], rotation = plan.kind[k] == FREE ? first + 3 : first;
     if (j < rotation) return;
-    for (int i = first; i < last; i++) {
-      const V* t = axes + 6 * i;
-      if (i >= rotation) {
-        const V half = V(0.5) * dot(t, bent);
+    for (int i = first; i < first + freedoms(plan.kind[k]); i++) {
+      const V* t = axes + S * i;
+      if (bent && i >= rotation) {
+        const V half = V(0.5) * dot<T>(t, bent);
         matrix[i * n + j] += half;
         matrix[j * n + i] += half;
       }
-      if (on_chord) matrix[j * n + i] = fma(share, along(t, turning), matrix[j * n + i]);
+      matrix[j * n + i] += along(t, turning);
     }
   }
 
   // The chord's slopes are those of components along the body's own axes; the exponential chart's are less by ½ [r]×.
-  void lose_half_the_torque() {
-    const int n = plan.nv;
-    for (int k = 0; k < plan.nodes; k++) {
-      if (plan.kind[k] == HINGE || plan.kind[k] == SLIDE) continue;
-      const int i = plan.v[k] + (plan.kind[k] == FREE ? 3 : 0);
-      V r[3];
-      for (int a = 0; a < 3; a++) r[a] = V(0.5) * worked(chord_axes + 6 * (i + a), pulls[k].moment, pulls[k].force);
-      matrix[i * n + i + 1] += r[2];
-      matrix[i * n + i + 2] -= r[1];
-      matrix[(i + 1) * n + i] -= r[2];
-      matrix[(i + 1) * n + i + 2] += r[0];
-      matrix[(i + 2) * n + i] += r[1];
-      matrix[(i + 2) * n + i + 1] -= r[0];
+  void lose_half_the_torque(int k) {
+    const int n = plan.nv, i = plan.v[k] + straight(plan.kind[k]);
+    V r[3];
+    for (int a = 0; a < 3; a++) {
+      const V* s = chord_axes + S * (i + a);
+      r[a] = V(0.5) * (dot<T>(s, pulls[k].torque) + dot<D>(s + T, pulls[k].force));
     }
+    matrix[i * n + i + 1] += r[2];
+    matrix[i * n + i + 2] -= r[1];
+    matrix[(i + 1) * n + i] -= r[2];
+    matrix[(i + 1) * n + i + 2] += r[0];
+    matrix[(i + 2) * n + i] += r[1];
+    matrix[(i + 2) * n + i + 1] -= r[0];
   }
 };
 

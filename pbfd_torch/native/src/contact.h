@@ -32,7 +32,7 @@ inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> n
     const int k = plan.carrier[i];
     const V radius = V(plan.radius[i]), start = reach - height(plan, i, step.start, before);
     const V n[3] = {V(plan.normal[3 * i]), V(plan.normal[3 * i + 1]), V(plan.normal[3 * i + 2])};
-    V roll[9], moved[3];
+    V roll[9] = {}, moved[3];
     const bool round = any(radius > zero);
     for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
     if (round) {

@@ -41,21 +41,20 @@ template <class V, class N> struct EnergyMomentum {
   // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it.
   M advance(Balance<V, N>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
     const int n = plan.nv;
-    const V h = b.dt, zero(0), half(0.5);
+    const V h = b.dt, per = V(1) / h, twice = per + per, zero(0), half(0.5);
     split_forces(b, q);
     difference(plan, b.q_start, q, after.average);
-    for (int i = 0; i < n; i++) after.average[i] = after.average[i] / h;
+    for (int i = 0; i < n; i++) after.average[i] = per * after.average[i];
 
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions
-    motion_axes(plan, b.start, b.chord_axes);
-    pose_rates(plan, b.start, b.chord_axes, before.v, twist, rates);
+    pose_rates(plan, b.start, b.start_axes, before.v, twist, rates);
     for (int k = 0; k < plan.nodes; k++) {
       const V* rate = rates + 12 * k;
       V next[12];
       for (int i = 0; i < 9; i++)
-        next[i] = fma(V(2), (b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i]) / h, -rate[i]);
+        next[i] = fma(twice, b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i], -rate[i]);
       for (int i = 0; i < 3; i++)
-        next[9 + i] = fma(V(2), (b.now.position[3 * k + i] - b.start.position[3 * k + i]) / h, -rate[9 + i]);
+        next[9 + i] = fma(twice, b.now.position[3 * k + i] - b.start.position[3 * k + i], -rate[9 + i]);
       pushed(k, b.now, next, sums[k]);
     }
     sum_up();
@@ -63,7 +62,7 @@ template <class V, class N> struct EnergyMomentum {
       impulse[i] = h * rough[i];
       momentum[i] = V(plan.armature[i]) * fma(V(2), after.average[i], -before.v[i]);
     }
-    each_freedom([&](int k, int i) { momentum[i] += worked(b.axes + 6 * i, sums[k].moment, sums[k].force); });
+    each_freedom([&](int k, int i) { momentum[i] += dot(b.axes + 6 * i, sums[k].torque) + dot(b.axes + 6 * i + 3, sums[k].force); });
     for (int i = 0; i < n; i++) momentum[i] -= h * fma(ahead(i), smooth[i], rough[i]);
 
     masses(b);
@@ -85,7 +84,7 @@ template <class V, class N> struct EnergyMomentum {
     substitute_along_the_tree(plan, matrix, after.lag);
 
     for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
-    const V first = kinetic(b.start, b.chord_axes, total);
+    const V first = kinetic(b.start, b.start_axes, total);
     for (int i = 0; i < n; i++) total[i] = fma(half, after.steady[i], after.v[i]);
     const V last = kinetic(b.now, b.axes, total);
     V work(0), spurious(0), turned(0);
@@ -136,9 +135,9 @@ template <class V, class N> struct EnergyMomentum {
   // Generalised forces of contacts, limits and dry friction, and of what is `Fitted`, as if taken whole.
   void split_forces(const Balance<V, N>& b, const V* q) {
     const JointStep<V> step = b.steps();
-    for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = V(0);
-    joint_loads<SMOOTH>(plan, step, q, smooth, static_cast<V*>(nullptr));
-    joint_loads<ROUGH>(plan, step, q, rough, static_cast<V*>(nullptr));
+    for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = other[i] = V(0);  // slopes are not asked for
+    joint_loads<SMOOTH>(plan, step, q, smooth, other);
+    joint_loads<ROUGH>(plan, step, q, rough, other);
     each_freedom([&](int k, int i) {
       if (b.pushes[k].any) rough[i] += worked(b.axes + 6 * i, b.pushes[k].moment, b.pushes[k].force);
     });
@@ -149,21 +148,23 @@ template <class V, class N> struct EnergyMomentum {
   void pushed(int k, Poses<V> at, const V* rate, Pull<V>& out) const {
     const N *center = plan.center + 3 * k, *second = plan.second + 9 * k;
     const V *R = at.rotation + 9 * k, mass = V(plan.mass[k]);
-    V spread[9], x[3], speed[3];
+    V spread[9], moment[9], x[3], speed[3];
     product(rate, second, spread);
-    product_transposed(spread, R, out.moment);
+    product_transposed(spread, R, moment);
     times(R, center, x), times(rate, center, speed);
-    for (int i = 0; i < 3; i++) x[i] += at.position[3 * k + i], out.force[i] = mass * (speed[i] + rate[9 + i]);
-    for (int i = 0; i < 3; i++)
-      for (int j = 0; j < 3; j++) out.moment[3 * i + j] = fma(out.force[i], x[j], out.moment[3 * i + j]);
+    for (int i = 0; i < 3; i++) {
+      x[i] += at.position[3 * k + i];
+      out.force[i] = mass * (speed[i] + rate[9 + i]), out.first[i] = mass * x[i];
+    }
+    curl<3>(moment, out.torque);
+    add_cross(x, out.force, out.torque);
     // beside it, what the mass matrix needs
     product(R, second, spread);
-    product_transposed(spread, R, out.second);
-    out.mass = mass;
-    for (int i = 0; i < 3; i++) out.first[i] = out.on_chord[i] = mass * x[i];
+    product_transposed(spread, R, moment);
     for (int i = 0; i < 3; i++)
-      for (int j = 0; j < 3; j++) out.second[3 * i + j] = fma(out.first[i], x[j], out.second[3 * i + j]);
-    for (V& y : out.at_end) y = V(0);
+      for (int j = 0; j < 3; j++) moment[3 * i + j] = fma(out.first[i], x[j], moment[3 * i + j]);
+    resistance<3>(moment, out.turning);
+    out.any = true;
   }
   void sum_up() {
     for (int k = plan.nodes - 1; k > 0; k--)
@@ -193,7 +194,7 @@ template <class V, class N> struct EnergyMomentum {
     each_freedom([&](int k, int j) {
       const Pull<V>& p = sums[k];
       V below[6];
-      p.answer(b.axes + 6 * j, below);
+      answer(p, V(plan.carried[k]), p.first, b.axes + 6 * j, below);
       for (int up = k; up >= 0; up = plan.parent[up])
         for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++) {
           const V* t = b.axes + 6 * i;

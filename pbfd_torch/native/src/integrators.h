@@ -33,7 +33,7 @@ template <class V, class N> inline void pose_rates(const Plan<N>& plan, Poses<V>
 template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall, V* room) {
   const Plan<N>& plan = b.plan;
   const V* rate = room + 6 * plan.nodes;
-  pose_rates(plan, b.start, b.axes, v, room, room + 6 * plan.nodes);
+  pose_rates(plan, b.start, b.start_axes, v, room, room + 6 * plan.nodes);
   for (int k = 0; k < plan.nodes; k++, rate += 12) {
     for (int i = 0; i < 9; i++) b.target.rotation[9 * k + i] = fma(b.dt, rate[i], b.start.rotation[9 * k + i]);
     for (int i = 0; i < 3; i++)
@@ -45,11 +45,11 @@ template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall
 // room: 18 per node.
 template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, const V* q, const V* v, V* room) {
   for (int i = 0; i < b.plan.nq; i++) b.q_start[i] = q[i];
-  place(b.plan, q, b.start);
-  motion_axes(b.plan, b.start, b.axes);
-  b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5), b.on_chord = true;
+  place(b.plan, q, b.start, b.start_axes);
+  b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5);
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
+  b.begin();
 }
 
 }  // namespace pbfd

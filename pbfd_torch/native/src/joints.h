@@ -16,10 +16,41 @@ template <class V> struct JointStep {
 
 enum Loads { SMOOTH = 1, ROUGH = 2, ROTORS = 4, ALL = 7 };  // springs, damping, actuators; limits, dry friction; armatures
 
-// Adds r [nv] and its slopes [nv × nv] of these loads, each where it is wanted (not null).
-template <int LOADS = ALL, class V, class N>
-inline void joint_loads(const Plan<N>& plan, const JointStep<V>& step, const V* q, V* residual, V* matrix) {
-  const int n = plan.nv;
+// Balls and free joints, whose coordinates do not add up: ½ c ‖log(q̂⁻¹ q)‖² of springs, damping and rotors. Adds its gradient and
+// its Hessian, each where it is wanted (not null).
+template <int LOADS = ALL, class V, class N, int D>
+inline void turning_loads(const Plan<N, D>& plan, int k, const JointStep<V>& step, const V* q, V* residual, V* matrix) {
+  const int n = plan.nv, i = plan.v[k], c = plan.q[k], turn = straight(plan.kind[k]), size = freedoms(plan.kind[k]);
+  const V zero(0), per_dt = V(1) / step.dt;
+  const V* aims[3] = {nullptr, step.start, step.target};
+  V rest[7];
+  for (int j = 0; j < coordinates(plan.kind[k]); j++) rest[j] = V(plan.rest[c + j]);
+  for (int what = LOADS & SMOOTH ? 0 : 2; what < (LOADS & ROTORS ? 3 : 2); what++) {
+    const N* number = (what == 0 ? plan.spring : what == 1 ? plan.damping : plan.armature) + i;
+    const V* aim = what == 0 ? rest : aims[what] + c;
+    bool there = false;
+    for (int j = 0; j < size; j++) there |= any(number[j] > N(0));
+    if (!there) continue;
+    const V back[4] = {aim[turn], -aim[turn + 1], -aim[turn + 2], -aim[turn + 3]};
+    V gap[6], between[4], bent[9];
+    for (int j = 0; j < turn; j++) gap[j] = q[c + j] - aim[j];
+    quaternion_product(back, q + c + turn, between);
+    quaternion_log(between, gap + turn);
+    if (matrix) log_jacobian(gap + turn, zero, bent);
+    for (int j = 0; j < size; j++) {
+      const V own = V(number[j]) * (what == 0 ? V(1) : what == 1 ? per_dt : step.weight);
+      if (residual) residual[i + j] = fma(own, gap[j], residual[i + j]);
+      if (!matrix) continue;
+      V* row = matrix + n * (i + j) + i;
+      if (j < turn) row[j] += own;
+      for (int b = 0; j >= turn && b < 3; b++) row[turn + b] = fma(own, bent[3 * (j - turn) + b], row[turn + b]);
+    }
+  }
+}
+
+// Adds r [nv] of these loads, and their slopes [nv] where each freedom has its own.
+template <int LOADS = ALL, class V, class N, int D>
+inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const V* q, V* residual, V* slopes) {
   const V zero(0), per_dt = V(1) / step.dt;
   for (int k = 0; k < plan.nodes; k++) {
     const int kind = plan.kind[k], i = plan.v[k], c = plan.q[k];
@@ -35,55 +66,26 @@ inline void joint_loads(const Plan<N>& plan, const JointStep<V>& step, const V* 
         const V rotor = V(plan.armature[i]) * step.weight;
         r = fma(rotor, x - step.target[c], r), slope += rotor;
       }
-      if (LOADS & ROUGH) {
-        V factor, falls, push, rises;
+      if ((LOADS & ROUGH) && any(plan.dry[i] > N(0))) {
+        V factor, falls;
         const V size = abs(moved);
         slip_factor(size, V(plan.dry_speed[0]) * step.dt, factor, falls);
         r = fma(V(plan.dry[i]) * factor, moved, r);
         slope = fma(V(plan.dry[i]), fma(falls * size, size, factor), slope);
+      }
+      const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
+      if ((LOADS & ROUGH) && any((under > zero) | (over > zero))) {
+        V push, rises;
         const V range = V(plan.limit_release[0]) * step.dt, stiffness = V(plan.limit[i]);
-        const V low = V(plan.lower[i]), high = V(plan.upper[i]);
-        releasing(stiffness, low - x, max(low - step.start[c], zero), range, push, rises);
+        releasing(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), range, push, rises);
         r -= push, slope += rises;
-        releasing(stiffness, x - high, max(step.start[c] - high, zero), range, push, rises);
+        releasing(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), range, push, rises);
         r += push, slope += rises;
       }
-      if (residual) residual[i] += r;
-      if (matrix) matrix[i * n + i] += slope;
+      residual[i] += r, slopes[i] += slope;
       continue;
     }
-    // coordinates that do not add up: ½ c ‖log(q̂⁻¹ q)‖² and its Hessian
-    if (!(LOADS & (SMOOTH | ROTORS))) continue;
-    const int turn = kind == FREE ? 3 : 0;
-    V gap[3 * 6];
-    const V* aims[3] = {nullptr, step.start, step.target};
-    V rest[7];
-    for (int j = 0; j < coordinates(kind); j++) rest[j] = V(plan.rest[c + j]);
-    for (int what = LOADS & SMOOTH ? 0 : 2; what < (LOADS & ROTORS ? 3 : 2); what++) {
-      const V* aim = what == 0 ? rest : aims[what] + c;
-      V* d = gap + 6 * what;
-      for (int j = 0; j < turn; j++) d[j] = q[c + j] - aim[j];
-      const V back[4] = {aim[turn], -aim[turn + 1], -aim[turn + 2], -aim[turn + 3]};
-      V between[4];
-      quaternion_product(back, q + c + turn, between);
-      quaternion_log(between, d + turn);
-      for (int j = 0; j < turn + 3; j++) {
-        const int dof = i + j;
-        const V rotor = V(plan.armature[dof]) * step.weight, damping = V(plan.damping[dof]) * per_dt;
-        const V own = what == 0 ? V(plan.spring[dof]) : what == 1 ? damping : rotor;
-        if (residual) residual[dof] = fma(own, d[j], residual[dof]);
-        if (matrix && j < turn) matrix[dof * n + dof] += own;
-        if (matrix && j == turn) {
-          V bent[9];
-          log_jacobian(d + turn, zero, bent);
-          for (int a = 0; a < 3; a++)
-            for (int b = 0; b < 3; b++) {
-              V& entry = matrix[(dof + a) * n + dof + b];
-              entry = fma(own, bent[3 * a + b], entry);
-            }
-        }
-      }
-    }
+    if (LOADS & (SMOOTH | ROTORS)) turning_loads<LOADS>(plan, k, step, q, residual, static_cast<V*>(nullptr));
   }
   for (int a = 0; LOADS & SMOOTH && a < plan.nu; a++) {
     const int c = plan.actuated_q[a], i = plan.actuated_v[a];
@@ -92,8 +94,8 @@ inline void joint_loads(const Plan<N>& plan, const JointStep<V>& step, const V* 
     const V drive = fma(V(plan.gain[a]), asked, V(plan.bias[a])), stiffness = V(plan.stiffness[a]);
     const V falls = fma(share, stiffness, V(plan.resistance[a]) * per_dt);
     const V free = drive - stiffness * before - falls * moved, low = V(plan.least_force[a]), high = V(plan.most_force[a]);
-    if (residual) residual[i] -= share * gear * clamped(free, low, high);
-    if (matrix) matrix[i * n + i] += select((free > low) & (free < high), share * falls * gear * gear, zero);
+    residual[i] -= share * gear * clamped(free, low, high);
+    slopes[i] += select((free > low) & (free < high), share * falls * gear * gear, zero);
   }
 }
 

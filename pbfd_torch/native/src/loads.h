@@ -13,34 +13,46 @@ template <class V> inline V worked(const V* s, const V* moment, const V* force) 
   return dot(s, torque) + dot(s + 3, force);
 }
 
-// Inertial loads of a node. Their work is done on the chord of the step, or at its end: then both are one.
-template <class V> struct Pull {
-  V moment[9], force[3];  // [G | g] of points on the chord
-  V at_end[9];            // G of the points at the step's end
-  V second[9];            // Σ m p p̄ᵀ, p at the end, p̄ on the chord
-  V first[3], on_chord[3], mass;  // Σ m p, Σ m p̄, Σ m
+// Inertial loads of a node, about the world's origin.
+template <class V, int D = 3> struct Pull {
+  static constexpr int T = turns(D);
+  V torque[T], force[D];
+  V turning[T * T];  // tr(K) 1 − K of K = Σ m p p̃ᵀ
+  V first[D];        // Σ m p
+  bool any;
 
-  // How the wrench on the points of the chord answers a unit twist s = (ω, v) of the node: A s.
-  void answer(const V* s, V* out) const {
-    const V *w = s, *v = s + 3, sum = trace(second);
-    times(second, w, out);
-    for (int i = 0; i < 3; i++) out[i] = fma(sum, w[i], -out[i]), out[3 + i] = mass * v[i];
-    add_cross(on_chord, v, out);
-    add_cross(w, first, out + 3);
-  }
-  void clear() {
-    for (V& x : moment) x = V(0);
-    for (V& x : at_end) x = V(0);
-    for (V& x : second) x = V(0);
-    for (int i = 0; i < 3; i++) force[i] = first[i] = on_chord[i] = V(0);
-    mass = V(0);
-  }
   void add(const Pull& o) {
-    for (int i = 0; i < 9; i++) moment[i] += o.moment[i], at_end[i] += o.at_end[i], second[i] += o.second[i];
-    for (int i = 0; i < 3; i++) force[i] += o.force[i], first[i] += o.first[i], on_chord[i] += o.on_chord[i];
-    mass += o.mass;
+    if (!any) {
+      *this = o;
+      return;
+    }
+    for (int i = 0; i < T; i++) torque[i] += o.torque[i];
+    for (int i = 0; i < D; i++) force[i] += o.force[i], first[i] += o.first[i];
+    for (int i = 0; i < T * T; i++) turning[i] += o.turning[i];
   }
 };
+
+// How the wrench of masses, m (p moved by a unit twist s) at points p̃, answers s; `lever`: Σ m p̃.
+template <class V, int D> inline void answer(const Pull<V, D>& p, V mass, const V* arm, const V* s, V* out) {
+  constexpr int T = turns(D);
+  V beside[D];
+  times<T>(p.turning, s, out);
+  lever<D>(arm, s + T, beside);
+  for (int i = 0; i < T; i++) out[i] += beside[i];
+  swing<D>(s, p.first, beside);
+  for (int i = 0; i < D; i++) out[T + i] = fma(mass, s[T + i], beside[i]);
+}
+
+// The same from the other side: what a twist s of the wrench's works on.
+template <class V, int D> inline void answer_above(const Pull<V, D>& p, V mass, const V* arm, const V* s, V* out) {
+  constexpr int T = turns(D);
+  V beside[D];
+  transposed_times<T>(p.turning, s, out);
+  lever<D>(p.first, s + T, beside);
+  for (int i = 0; i < T; i++) out[i] += beside[i];
+  swing<D>(s, arm, beside);
+  for (int i = 0; i < D; i++) out[T + i] = fma(mass, s[T + i], beside[i]);
+}
 
 // Contact loads of a node.
 template <class V> struct Push {

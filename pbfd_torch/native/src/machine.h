@@ -111,7 +111,7 @@ template <class V, class N> struct Machine {
 
   // Lanes whose step has ended go on with the next one, or with another world; who sets out now.
   M arrive() {
-    newton.balance.evaluate(newton.trial);  // running lanes look again; the others are where their step has ended
+    if (!newton.settled) newton.balance.evaluate(newton.trial);
     const M refused = scheme.advance(newton.balance, newton.q, before, after);
     M deep, far;
     look_for_hazards(deep, far);

@@ -25,15 +25,18 @@ template <class V, class N> struct Newton {
   V tolerance, most;  // ‖r/scale‖; evaluations
   // where every lane stands
   V *q, *trial, *retreat, *direction, *step, *column, *diagonal;
+  V* allowed;  // 1 / (scale + rounding/tolerance) of each residual
   V length, start_work, low, low_work, low_curve, high, high_work, high_curve;
   V error, status, evaluations, iterations, far;
   M running, at_guess, at_retreat, searching;
+  bool settled;  // every lane that does not run has been evaluated where it stays
 
-  static int room(Sizes s) { return Balance<V, N>::room(s) + Outlook<V, N>::room(s) + 3 * s.nq + 4 * s.nv; }
+  static int room(Sizes s) { return Balance<V, N>::room(s) + Outlook<V, N>::room(s) + 3 * s.nq + 5 * s.nv; }
 
   Newton(const Plan<N>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
     q = arena.take(plan.nq), trial = arena.take(plan.nq), retreat = arena.take(plan.nq);
     direction = arena.take(plan.nv), step = arena.take(plan.nv), column = arena.take(plan.nv), diagonal = arena.take(plan.nv);
+    allowed = arena.take(plan.nv);
     for (int i = 0; i < plan.nv; i++) direction[i] = V(0);
     length = start_work = low = low_work = low_curve = high = high_work = high_curve = V(0);
     error = status = evaluations = iterations = V(0), far = V(1);
@@ -49,6 +52,9 @@ template <class V, class N> struct Newton {
     V farthest(0);
     for (int i = 0; i < 3 * plan.nodes; i++) farthest = max(farthest, abs(balance.start.position[i]));
     far = select(which, farthest + V(plan.reach[0]), far);
+    const V per = V(8 * EPSILON) * balance.weight / tolerance;
+    for (int i = 0; i < plan.nv; i++)
+      allowed[i] = V(1) / fma(per, fma(far, V(plan.heft[i]), V(plan.armature[i])), V(plan.scale[i]));
     running = running | which, at_guess = at_guess | which;
     searching = searching & !which, at_retreat = at_retreat & !which;
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
@@ -70,6 +76,7 @@ template <class V, class N> struct Newton {
     error = select(arrived | lost | retreating, reached, error);
     status = select(arrived, V(SOLVED), select(lost, V(NON_FINITE), status));
     for (int i = 0; i < plan.nq; i++) q[i] = select(arrived, trial[i], q[i]);
+    const M ran = running;
     running = running & !arrived & !lost;
 
     V work(0);
@@ -86,6 +93,7 @@ template <class V, class N> struct Newton {
     running = running & !stalled & (evaluations < most);
     at_retreat = (at_retreat | retreating) & !accept, at_guess = at_guess & !accept & !retreating;
     searching = searching | accept;
+    settled = !any(ran & !running & !arrived);
 
     pbfd::retract(plan, q, direction, length, trial);
     for (int i = 0; i < plan.nq; i++) trial[i] = select(running, select(retreating, retreat[i], trial[i]), q[i]);
@@ -95,11 +103,9 @@ template <class V, class N> struct Newton {
   // ‖r / (scale + rounding/tolerance)‖ (BalanceObjective.error). What rounded coordinates make of J is asked where it may decide.
   V judged(bool& assembled) {
     const int n = plan.nv;
-    const V per = V(8 * EPSILON) * balance.weight / tolerance;
     V whole(0), strict(0);
     for (int i = 0; i < n; i++) {
-      const V r = balance.residual[i], scale = V(plan.scale[i]), rounding = per * fma(far, V(plan.heft[i]), V(plan.armature[i]));
-      const V a = r / scale, b = r / (scale + rounding);
+      const V r = balance.residual[i], a = r * V(N(1) / plan.scale[i]), b = r * allowed[i];
       whole = fma(a, a, whole), strict = fma(b, b, strict);
     }
     const V least = tolerance * V(1 / NEGLIGIBLE) * sqrt(whole);
@@ -107,12 +113,12 @@ template <class V, class N> struct Newton {
     const M near = running & !(first <= tolerance) & (first <= (sizeof(T) == 8 ? V(1e3) * tolerance : V(1)));
     if (!any(near)) return first;
     balance.assemble(trial, true), assembled = true;
+    const V moved = V(2 * EPSILON) / tolerance;
     V lenient(0);
     for (int i = 0; i < n; i++) {
       V felt(0);
       for (int j = 0; j < n; j++) felt = fma(abs(balance.matrix[i * n + j]), extent(j), felt);
-      const V scale = V(plan.scale[i]), rounding = per * fma(far, V(plan.heft[i]), V(plan.armature[i]));
-      const V a = balance.residual[i] / (scale + rounding + V(2 * EPSILON) * felt / tolerance);
+      const V b = balance.residual[i] * allowed[i], a = b / fma(moved * felt, allowed[i], V(1));
       lenient = fma(a, a, lenient);
     }
     return select(near, max(sqrt(lenient), least), first);

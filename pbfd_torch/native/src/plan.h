@@ -10,18 +10,22 @@ namespace pbfd {
 enum Joint { HINGE, SLIDE, BALL, FREE };
 inline int coordinates(int kind) { return kind == FREE ? 7 : kind == BALL ? 4 : 1; }
 inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; }
+inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0; }  // of these, the first
 
 struct Sizes {
   int nodes, nq, nv, nu, candidates;
 };
 
-template <class N> struct Plan : Sizes {
+template <class N, int D = 3> struct Plan : Sizes {
   // nodes, parents first; −1: the world
   const int *parent, *kind, *q, *v;
-  const N *frame, *origin;  // [9], [3] on the parent at the joint's reference
-  const N *axis, *reference;  // [3], [1]
+  const int* plain;  // 1 where its frame is turned as the parent's
+  const N *frame, *origin;  // [9], [3] on the parent at the joint's reference: hinges turn about its z, slides move along it
+  const N* reference;
   const N *mass, *center, *second;  // [1], [3], [9] ∫ρ (x − c)(x − c)ᵀ of all links on the node, in its frame
+  const N* carried;  // mass of it and of all that it moves
   // degrees of freedom
+  const int *depth, *above;  // how many others a dof rides on, and which: [nv] each, the nearest first
   const N *scale;  // what counts as a force of one
   const N *heft;   // [kg, kg m] what rounded positions weigh
   const N *turns;  // 1 where it rotates, else 0
@@ -44,11 +48,12 @@ template <class N> struct Plan : Sizes {
   Plan(Sizes sizes, const int* ints, const N* numbers) : Sizes(sizes) {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
-    parent = whole(nodes), kind = whole(nodes), q = whole(nodes), v = whole(nodes);
+    parent = whole(nodes), kind = whole(nodes), q = whole(nodes), v = whole(nodes), plain = whole(nodes);
+    depth = whole(nv), above = whole(nv * nv);
     actuated_q = whole(nu), actuated_v = whole(nu);
     carrier = whole(candidates);
-    frame = real(9 * nodes), origin = real(3 * nodes), axis = real(3 * nodes), reference = real(nodes);
-    mass = real(nodes), center = real(3 * nodes), second = real(9 * nodes);
+    frame = real(9 * nodes), origin = real(3 * nodes), reference = real(nodes);
+    mass = real(nodes), center = real(3 * nodes), second = real(9 * nodes), carried = real(nodes);
     scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
     spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
@@ -59,8 +64,8 @@ template <class N> struct Plan : Sizes {
     gravity = real(3), reach = real(1), release = real(1), slip_speed = real(1), limit_release = real(1), dry_speed = real(1);
   }
 
-  static int whole_numbers(Sizes s) { return 4 * s.nodes + 2 * s.nu + s.candidates; }
-  static int real_numbers(Sizes s) { return 29 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 12 * s.candidates + 8; }
+  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.candidates; }
+  static int real_numbers(Sizes s) { return 27 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 12 * s.candidates + 8; }
 };
 
 // Memory that the caller owns, handed out piece by piece.

@@ -5,77 +5,65 @@
 
 namespace pbfd {
 
-// Poses of all nodes: rotation [9] and position [3] each.
+// Poses of all nodes: rotation [D × D] and position [D] each.
 template <class V> struct Poses {
   V *rotation, *position;
-  static Poses in(Arena<V>& arena, Sizes s) { return {arena.take(9 * s.nodes), arena.take(3 * s.nodes)}; }
+  template <int D = 3> static Poses in(Arena<V>& arena, Sizes s) { return {arena.take(D * D * s.nodes), arena.take(D * s.nodes)}; }
 };
 
-template <class V, class N> inline void place(const Plan<N>& plan, const V* q, Poses<V> out) {
+// The velocity that a turning ω about p gives what is at the world's origin: p × ω.
+template <int D, class V> inline void about(const V* p, const V* w, V* out) {
+  swing<D>(w, p, out);
+  for (int i = 0; i < D; i++) out[i] = -out[i];
+}
+
+// Where all nodes are at q, and the unit twists (ω, v at the world's origin) of all degrees of freedom, [turns(D) + D] each.
+template <class V, class N, int D> inline void place(const Plan<N, D>& plan, const V* q, Poses<V> out, V* axes) {
+  constexpr int T = turns(D), S = T + D;
+  const V zero(0), one(1);
   for (int k = 0; k < plan.nodes; k++) {
     const int up = plan.parent[k], kind = plan.kind[k];
-    const N *frame = plan.frame + 9 * k, *origin = plan.origin + 3 * k, *axis = plan.axis + 3 * k;
-    V *R = out.rotation + 9 * k, *p = out.position + 3 * k, base[9];
+    const N *frame = plan.frame + D * D * k, *origin = plan.origin + D * k;
+    V *R = out.rotation + D * D * k, *p = out.position + D * k, *s = axes + S * plan.v[k], turned[D * D];
+    const V *base = turned, *x = q + plan.q[k];
     if (up < 0) {
-      for (int i = 0; i < 9; i++) base[i] = V(frame[i]);
-      for (int i = 0; i < 3; i++) p[i] = V(origin[i]);
+      for (int i = 0; i < D * D; i++) turned[i] = V(frame[i]);
+      for (int i = 0; i < D; i++) p[i] = V(origin[i]);
     } else {
-      product(out.rotation + 9 * up, frame, base);
-      times(out.rotation + 9 * up, origin, p);
-      for (int i = 0; i < 3; i++) p[i] += out.position[3 * up + i];
+      const V *R_up = out.rotation + D * D * up, *p_up = out.position + D * up;
+      if (plan.plain[k])
+        base = R_up;
+      else
+        product<D>(R_up, frame, turned);
+      times<D>(R_up, origin, p);
+      for (int i = 0; i < D; i++) p[i] += p_up[i];
     }
-    const V* x = q + plan.q[k];
     if (kind == SLIDE) {
-      V along[3];
-      times(base, axis, along);
       const V shift = x[0] - V(plan.reference[k]);
-      for (int i = 0; i < 3; i++) p[i] = fma(shift, along[i], p[i]);
-      for (int i = 0; i < 9; i++) R[i] = base[i];
+      for (int i = 0; i < T; i++) s[i] = zero;
+      for (int i = 0; i < D; i++) s[T + i] = base[D * i + D - 1], p[i] = fma(shift, s[T + i], p[i]);
+      for (int i = 0; i < D * D; i++) R[i] = base[i];
     } else if (kind == HINGE) {
-      // Rodrigues: every row b of the base turns about the axis a, b cos + (a·b)(1 − cos) a + sin b × a
       V sine, cosine;
       sine_cosine(x[0] - V(plan.reference[k]), sine, cosine);
-      const V a[3] = {V(axis[0]), V(axis[1]), V(axis[2])};
-      for (int i = 0; i < 3; i++) {
-        const V* b = base + 3 * i;
-        V beside[3];
-        cross(b, a, beside);
-        const V along = dot(b, a) * (V(1) - cosine);
-        for (int j = 0; j < 3; j++) R[3 * i + j] = fma(cosine, b[j], fma(sine, beside[j], along * a[j]));
+      for (int i = 0; i < D; i++) {
+        const V a = base[D * i], b = base[D * i + 1];
+        R[D * i] = fma(cosine, a, sine * b), R[D * i + 1] = fma(cosine, b, -(sine * a));
+        R[D * i + 2] = s[i] = base[D * i + 2];
       }
+      about<D>(p, s, s + T);
     } else {
       V turn[9];
       quaternion_matrix(x + (kind == FREE ? 3 : 0), turn);
       product(base, turn, R);
       if (kind == FREE) {  // the world's axes: plan.py takes no others
         for (int i = 0; i < 3; i++) p[i] += x[i];
-      }
-    }
-  }
-}
-
-// Unit twists (ω, v at the world's origin) of all degrees of freedom, [6] each, about axes that ride on these poses: those at
-// the end of the step, or on its chord, where rotations have shrunk.
-template <class V, class N> inline void motion_axes(const Plan<N>& plan, Poses<V> at, V* axes) {
-  const V zero(0), one(1);
-  for (int k = 0; k < plan.nodes; k++) {
-    const V *R = at.rotation + 9 * k, *p = at.position + 3 * k;
-    V* s = axes + 6 * plan.v[k];
-    const int kind = plan.kind[k];
-    if (kind == HINGE) {
-      times(R, plan.axis + 3 * k, s);
-      cross(p, s, s + 3);
-    } else if (kind == SLIDE) {
-      s[0] = s[1] = s[2] = zero;
-      times(R, plan.axis + 3 * k, s + 3);
-    } else {
-      if (kind == FREE) {
         for (int i = 0; i < 3; i++, s += 6)
           for (int j = 0; j < 6; j++) s[j] = j == 3 + i ? one : zero;
       }
       for (int i = 0; i < 3; i++, s += 6) {
         for (int j = 0; j < 3; j++) s[j] = R[3 * j + i];
-        cross(p, s, s + 3);
+        about<3>(p, s, s + 3);
       }
     }
   }

@@ -1,10 +1,18 @@
-// Vectors [3] and matrices [9], row by row, of one world or of several.
+// Vectors [D] and matrices [D × D], row by row, of one world or of several; in space, D = 3, or in a plane, D = 2.
+//
+// What turns is a vector [3] in space, and one number in a plane, [turns(D)]: a rotation's speed ω, a torque.
 #pragma once
 #include "scalar.h"
 
 namespace pbfd {
 
-template <class V> inline V dot(const V* a, const V* b) { return fma(a[0], b[0], fma(a[1], b[1], a[2] * b[2])); }
+constexpr int turns(int d) { return d == 3 ? 3 : 1; }
+
+template <int D = 3, class V> inline V dot(const V* a, const V* b) {
+  V sum = a[D - 1] * b[D - 1];
+  for (int i = D - 2; i >= 0; i--) sum = fma(a[i], b[i], sum);
+  return sum;
+}
 
 template <class V> inline void cross(const V* a, const V* b, V* out) {
   const V x = fma(a[1], b[2], -(a[2] * b[1])), y = fma(a[2], b[0], -(a[0] * b[2])), z = fma(a[0], b[1], -(a[1] * b[0]));
@@ -20,30 +28,88 @@ template <class V> inline void add_cross(const V* a, const V* b, V* out) {
   out[2] += fma(a[0], b[1], -(a[1] * b[0]));
 }
 
+// out = ω × x: how fast x moves.
+template <int D, class V> inline void swing(const V* w, const V* x, V* out) {
+  if constexpr (D == 3) {
+    cross(w, x, out);
+  } else {
+    const V y = w[0] * x[0];
+    out[0] = -(w[0] * x[1]);
+    out[1] = y;
+  }
+}
+
+// out = p × f: the torque of a force.
+template <int D, class V> inline void lever(const V* p, const V* f, V* out) {
+  if constexpr (D == 3)
+    cross(p, f, out);
+  else
+    out[0] = fma(p[0], f[1], -(p[1] * f[0]));
+}
+
+// The torque of forces f at points p, out of Σ f pᵀ.
+template <int D, class V> inline void curl(const V* M, V* out) {
+  if constexpr (D == 3) {
+    out[0] = M[7] - M[5];
+    out[1] = M[2] - M[6];
+    out[2] = M[3] - M[1];
+  } else {
+    out[0] = M[2] - M[1];
+  }
+}
+
 // out = M x; what is x may be a scene's numbers
-template <class V, class X> inline void times(const V* M, const X* x, V* out) {
-  for (int i = 0; i < 3; i++) out[i] = fma(M[3 * i], V(x[0]), fma(M[3 * i + 1], V(x[1]), M[3 * i + 2] * V(x[2])));
+template <int D = 3, class V, class X> inline void times(const V* M, const X* x, V* out) {
+  for (int i = 0; i < D; i++) {
+    V sum = M[D * i + D - 1] * V(x[D - 1]);
+    for (int j = D - 2; j >= 0; j--) sum = fma(M[D * i + j], V(x[j]), sum);
+    out[i] = sum;
+  }
 }
 
 // out = Mᵀ x
-template <class V> inline void transposed_times(const V* M, const V* x, V* out) {
-  for (int i = 0; i < 3; i++) out[i] = fma(M[i], x[0], fma(M[3 + i], x[1], M[6 + i] * x[2]));
+template <int D = 3, class V> inline void transposed_times(const V* M, const V* x, V* out) {
+  for (int i = 0; i < D; i++) {
+    V sum = M[D * (D - 1) + i] * x[D - 1];
+    for (int j = D - 2; j >= 0; j--) sum = fma(M[D * j + i], x[j], sum);
+    out[i] = sum;
+  }
 }
 
 // out = A B
-template <class A, class B, class V> inline void product(const A* a, const B* b, V* out) {
-  for (int i = 0; i < 3; i++)
-    for (int j = 0; j < 3; j++)
-      out[3 * i + j] = fma(V(a[3 * i]), V(b[j]), fma(V(a[3 * i + 1]), V(b[3 + j]), V(a[3 * i + 2]) * V(b[6 + j])));
+template <int D = 3, class A, class B, class V> inline void product(const A* a, const B* b, V* out) {
+  for (int i = 0; i < D; i++)
+    for (int j = 0; j < D; j++) {
+      V sum = V(a[D * i + D - 1]) * V(b[D * (D - 1) + j]);
+      for (int k = D - 2; k >= 0; k--) sum = fma(V(a[D * i + k]), V(b[D * k + j]), sum);
+      out[D * i + j] = sum;
+    }
 }
 
 // out = A Bᵀ
-template <class V> inline void product_transposed(const V* a, const V* b, V* out) {
-  for (int i = 0; i < 3; i++)
-    for (int j = 0; j < 3; j++)
-      out[3 * i + j] = fma(a[3 * i], b[3 * j], fma(a[3 * i + 1], b[3 * j + 1], a[3 * i + 2] * b[3 * j + 2]));
+template <int D = 3, class A, class B, class V> inline void product_transposed(const A* a, const B* b, V* out) {
+  for (int i = 0; i < D; i++)
+    for (int j = 0; j < D; j++) {
+      V sum = V(a[D * i + D - 1]) * V(b[D * j + D - 1]);
+      for (int k = D - 2; k >= 0; k--) sum = fma(V(a[D * i + k]), V(b[D * j + k]), sum);
+      out[D * i + j] = sum;
+    }
 }
 
-template <class V> inline V trace(const V* M) { return M[0] + M[4] + M[8]; }
+template <int D = 3, class V> inline V trace(const V* M) {
+  V sum = M[0];
+  for (int i = 1; i < D; i++) sum += M[(D + 1) * i];
+  return sum;
+}
+
+// tr(M) 1 − M: how Σ m x xᵀ answers a turning; in a plane a number.
+template <int D, class V> inline void resistance(const V* M, V* out) {
+  if constexpr (D == 3) {
+    out[0] = M[4] + M[8], out[4] = M[0] + M[8], out[8] = M[0] + M[4];
+    out[1] = -M[1], out[2] = -M[2], out[3] = -M[3], out[5] = -M[5], out[6] = -M[6], out[7] = -M[7];
+  } else {
+    out[0] = M[0] + M[3];
+  }
+}
 
 }  // namespace pbfd
