@@ -21,7 +21,7 @@ NUMBERS = ("gained", "surplus", "peak")
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates")),
+        *((name, ctypes.c_int) for name in ("bytes", "dimension", "nodes", "nq", "nv", "nu", "candidates")),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -56,7 +56,7 @@ class Core:
         for name in ("pbfd_whole_numbers", "pbfd_real_numbers", "pbfd_room"):
             getattr(self._functions, name).restype = ctypes.c_long
         sizes = plan.sizes
-        self._plan = _Plan(plan.real.element_size(), *sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        self._plan = _Plan(plan.real.element_size(), plan.dimension, *sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (plan.whole.numel(), plan.real.numel()):
             raise ValueError(f"the plan has {plan.whole.numel()} and {plan.real.numel()} numbers: the core wants {wanted}")

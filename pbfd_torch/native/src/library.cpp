@@ -6,7 +6,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 2; }
+int pbfd_interface() { return 3; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -16,11 +16,11 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
 
-template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
+template <class V, int D> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
   using T = typename Kind<V>::Scalar;
-  const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
+  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   Arena<V> arena{static_cast<V*>(room)};
-  Machine<V, T> machine(plan, arena);
+  Machine<V, T, D> machine(plan, arena);
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
   const StepArrays<T> arrays{
@@ -32,18 +32,20 @@ template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, 
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_step* s, void* room) {
+template <class T, int D> void energy_momentum_of(const pbfd_plan* p, const pbfd_step* s, void* room) {
   if (s->last - s->first == 1)
-    energy_momentum<T>(p, s, room);
+    energy_momentum<T, D>(p, s, room);
   else
-    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>>(p, s, room);
+    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>, D>(p, s, room);
 }
 
 }  // namespace
 
 long pbfd_whole_numbers(const pbfd_plan* p) { return Plan<double>::whole_numbers(sizes(p)); }
 
-long pbfd_real_numbers(const pbfd_plan* p) { return Plan<double>::real_numbers(sizes(p)); }
+long pbfd_real_numbers(const pbfd_plan* p) {
+  return p->dimension == 3 ? Plan<double>::real_numbers(sizes(p)) : Plan<double, 2>::real_numbers(sizes(p));
+}
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
@@ -53,5 +55,9 @@ long pbfd_room(const pbfd_plan* p) {
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
-  p->bytes == 8 ? energy_momentum_of<double>(p, s, room) : energy_momentum_of<float>(p, s, room);
+  const bool plane = p->dimension == 2;
+  if (p->bytes == 8)
+    plane ? energy_momentum_of<double, 2>(p, s, room) : energy_momentum_of<double, 3>(p, s, room);
+  else
+    plane ? energy_momentum_of<float, 2>(p, s, room) : energy_momentum_of<float, 3>(p, s, room);
 }

@@ -16,21 +16,21 @@ template <class T> struct StepArrays {
   int *status, *evaluations, *iterations, *refused, *hazards;
 };
 
-template <class V, class N> struct Machine {
+template <class V, class N, int D = 3> struct Machine {
   using T = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   static constexpr int W = Kind<V>::lanes;
 
-  const Plan<N>& plan;
-  Newton<V, N> newton;
-  EnergyMomentum<V, N> scheme;
+  const Plan<N, D>& plan;
+  Newton<V, N, D> newton;
+  EnergyMomentum<V, N, D> scheme;
   Velocities<V> before, after;
   V *q, *guess, *room_to_begin;
 
   static int room(Sizes s) {
-    return Newton<V, N>::room(s) + EnergyMomentum<V, N>::room(s) + 10 * s.nv + 2 * s.nq + 18 * s.nodes;
+    return Newton<V, N, D>::room(s) + EnergyMomentum<V, N, D>::room(s) + 10 * s.nv + 2 * s.nq + 18 * s.nodes;
   }
-  Machine(const Plan<N>& scene, Arena<V>& arena)
+  Machine(const Plan<N, D>& scene, Arena<V>& arena)
       : plan(scene), newton(scene, arena), scheme(scene, arena), before(Velocities<V>::in(arena, scene)),
         after(Velocities<V>::in(arena, scene)) {
     q = arena.take(plan.nq), guess = arena.take(plan.nq), room_to_begin = arena.take(18 * plan.nodes);
@@ -84,14 +84,14 @@ template <class V, class N> struct Machine {
 
   // What is too deep, and who touches something and has turned by more than a quarter turn (contact/hazards.py).
   void look_for_hazards(M& deep, M& far) const {
-    const Balance<V, N>& b = newton.balance;
+    const Balance<V, N, D>& b = newton.balance;
     deep = far = M(false);
     for (int i = 0; i < plan.candidates; i++) {
       const int k = plan.carrier[i];
-      V c[3], turned(0);
+      V c[D], turned(0);
       const V depth = V(plan.radius[i]) + V(plan.margin[i]) - height(plan, i, b.now, c);
-      for (int j = 0; j < 9; j++) turned = fma(b.now.rotation[9 * k + j], b.start.rotation[9 * k + j], turned);
-      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(1)));
+      for (int j = 0; j < D * D; j++) turned = fma(b.now.rotation[D * D * k + j], b.start.rotation[D * D * k + j], turned);
+      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(D - 2)));
     }
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
