@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,11 +14,13 @@ from pbfd_torch import InputError, Simulator
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.models import SCENES
+from pbfd_torch.models import SCENES, file_setup
 from pbfd_torch.native.library import library
+from pbfd_torch.native.plan import planned
 from pbfd_torch.native.stepper import NativeStepper, uncovered
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.tree.rotations import skew
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -116,6 +119,44 @@ def test_batches_of_any_shape() -> None:
     shaped, solution, _ = native.made(dataclasses.replace(folded, memory=()), None)
     assert solution.status.shape == (2, 3)
     assert torch.equal(shaped.q.reshape(6, -1), flat.q)
+
+
+OBLIQUE = """<mujoco><compiler angle="radian"/><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="1 2 0.5"><joint type="slide" axis="0.8 -0.6 0"/><joint type="slide" axis="0 0 1"/>
+    <joint type="hinge" axis="0.6 0.8 0" pos="0.1 0 0.1"/><geom type="capsule" fromto="0 0 0 0.4 -0.3 0.1" size="0.05"/>
+    <body pos="0.4 -0.3 0.1" euler="0.3 0.2 0.1"><joint type="hinge" axis="%s" range="-0.5 0.8" limited="true" armature="0.01"/>
+      <geom type="box" size="0.05 0.1 0.2" pos="0.02 0.03 0.2"/></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["chain-fixed", "hopper", "walker", "oblique"])
+def test_a_plane_is_space_with_less(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scenes that move in a plane step in it as they do in space, in any plane, with hinges that turn ahead and back."""
+    if name == "oblique":  # −(0.6, 0.8, 0) in a frame that is turned
+        turn = torch.linalg.matrix_exp(skew(torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64)))
+        for axis in ([0.0, 0.2, 0.0], [0.0, 0.0, 0.1]):
+            turn = turn @ torch.linalg.matrix_exp(skew(torch.tensor(axis, dtype=torch.float64)))
+        axis = -turn.mT @ torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+        file = tmp_path / "oblique.xml"
+        file.write_text(OBLIQUE % " ".join(f"{x:.17g}" for x in axis.tolist()))
+        setup = file_setup(file, worlds=11)
+    else:
+        setup = SCENES[name](worlds=11)
+    simulator = Simulator(setup.scene, 0.01)
+    state = simulator.initial_state(*scattered(setup, 0, 0.3, 1.0))
+    flat = NativeStepper(simulator.eager)
+    assert planned(simulator.eager).dimension == 2
+    monkeypatch.setattr("pbfd_torch.native.plan.plane_of", lambda *_: None)
+    assert planned(simulator.eager).dimension == 3
+    spatial, solved = NativeStepper(simulator.eager), 0
+    for control in controls(simulator, 20, 11):
+        after, solution, _ = flat.made(state, control)
+        other, found, _ = spatial.made(state, control)
+        both = (solution.status == int(Status.SOLVED)) & (found.status == int(Status.SOLVED))
+        solved += int(both.sum())
+        close = (after.q - other.q).abs().amax(-1) < 1e-9
+        assert int((both & ~close).sum()) == 0
+        state = other
+    assert solved > 0.8 * 20 * 11
 
 
 @pytest.mark.parametrize(

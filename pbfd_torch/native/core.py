@@ -27,7 +27,7 @@ BLOCKS = 4  # for each thread: some worlds take longer than others
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "each", "nodes", "nq", "nv", "nu", "candidates")),
+        *((name, ctypes.c_int) for name in ("bytes", "dimension", "each", "nodes", "nq", "nv", "nu", "candidates")),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -110,7 +110,7 @@ class Core:
         self.plan, self._threads = plan, threads
         self._functions = library.functions
         each = plan.real.ndim > 1
-        self._plan = _Plan(plan.real.element_size(), each, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        self._plan = _Plan(plan.real.element_size(), plan.dimension, each, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), plan.real.shape[-1]):
             raise ValueError(f"the plan has {len(plan.whole)} and {plan.real.shape[-1]} numbers: the core wants {wanted}")

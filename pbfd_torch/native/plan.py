@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -12,6 +12,8 @@ from torch import Tensor
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
+from pbfd_torch.native.aligned import aligned
+from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
@@ -38,22 +40,28 @@ def _unknown(what: str) -> NotCompiledError:
 @dataclass(frozen=True, eq=False)
 class Plan:
     """sizes: nodes, nq, nv, nu, candidates. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or `[worlds, n]` where worlds
-    have numbers of their own."""
+    have numbers of their own. dimension: 2 where all moves in a plane."""
 
     sizes: tuple[int, int, int, int, int]
     whole: Tensor
     real: Tensor
+    dimension: int
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a stepper's scene. Raises `NotCompiledError` naming what the core does not know."""
     _require_covered(stepper)
-    a = _aligned(stepper.articulation)
+    a = aligned(stepper.articulation)
     known = _Terms(stepper, a)
     t = a.topology
     kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in zip(t.joint_sizes, t.joint_is_hinge, strict=True)]
-    whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start] + _plain(a) + _above(a)
+    whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
     act, candidates = known.actuators, known.candidates
+    nodes, touching, gravity = _nodes(a), candidates.numbers(a), stepper.scene.gravity
+    plane = plane_of(a, [gravity[None], *touching[5:6]])  # and the normals
+    if plane is not None:
+        nodes, touching, gravity = plane.nodes(a, nodes), plane.candidates(candidates.nodes, touching), gravity @ plane.basis
+    whole += _plain(nodes[0]) + _above(a)
     nu = 0
     driven: list[Tensor] = []
     if act is not None:
@@ -65,15 +73,16 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     scale = force_scale(a, 1.0).expand(t.nv)
     speeds = [known.release, known.slip_speed, known.limit_release, known.dry_speed]
     real = [
-        *_nodes(a),
+        *nodes,
         *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), known.share, known.spring, known.damping, known.armature),
         *(known.dry, a.lower, a.upper, known.limit, known.rest),
         *driven,
-        *candidates.numbers(a),
-        *(stepper.scene.gravity, reach(a), a.rest.new_tensor(speeds)),
+        *touching,
+        *(gravity, reach(a), a.rest.new_tensor(speeds)),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    return Plan((t.njoint, t.nq, t.nv, nu, len(candidates.nodes)), torch.tensor(whole, dtype=torch.int32), flat)
+    sizes = (t.njoint, t.nq, t.nv, nu, len(candidates.nodes))
+    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2)
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:
@@ -96,61 +105,26 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
         raise _unknown("a free joint that does not move along the world's axes")
 
 
-def _aligned(a: Articulation) -> Articulation:
-    """The same tree with nodes turned by constants, so that hinges turn about the node's z, and slides move along it."""
-    t, eye = a.topology, torch.eye(3, dtype=a.dtype)
-    z = eye[2]
-    frames = a.joint_frame.clone()
-    turns = [eye]  # of the world, and of each node
-    for j, (size, parent) in enumerate(zip(t.joint_sizes, t.joint_parent, strict=True)):
-        frame = _pose(turns[parent]).mT @ frames[j]
-        as_parent = frame[:3, :3].mT
-        frames[j] = frame
-        if size != (1, 1):
-            turns.append(eye)
-        elif torch.allclose(as_parent @ z, a.joint_axis[j], rtol=0.0, atol=4.0 * torch.finfo(a.dtype).eps):
-            turns.append(as_parent)
-            frames[j, :3, :3] = eye
-        else:
-            turns.append(_turning(a.joint_axis[j]))
-            frames[j, :3, :3] = frame[:3, :3] @ turns[-1]
-    links = torch.stack([_pose(turns[node]).mT @ frame for node, frame in zip(t.link_node, a.link_frame, strict=True)])
-    return replace(a, joint_frame=frames, joint_axis=z.expand(t.njoint, 3), link_frame=links)
-
-
-def _pose(rotation: Tensor) -> Tensor:
-    pose = torch.eye(4, dtype=rotation.dtype)
-    pose[:3, :3] = rotation
-    return pose
-
-
-def _turning(axis: Tensor) -> Tensor:
-    """A rotation that takes z to a unit vector; along x, y and z without rounding."""
-    x = torch.linalg.cross(torch.eye(3, dtype=axis.dtype)[int(axis.abs().argmin())], axis)
-    x = x / x.norm()
-    return torch.stack((x, torch.linalg.cross(axis, x), axis), dim=-1)
-
-
-def _plain(a: Articulation) -> list[int]:
+def _plain(frames: Tensor) -> list[int]:
     """Which nodes' frames are turned as their parents'."""
-    eye = torch.eye(3, dtype=a.dtype)
-    return [int(torch.equal(frame[:3, :3], eye)) for frame in a.joint_frame]
+    eye = torch.eye(frames.shape[-1], dtype=frames.dtype)
+    return [int(torch.equal(frame, eye)) for frame in frames]
 
 
 def _above(a: Articulation) -> list[int]:
-    """How many dofs each dof rides on, and which, the nearest first: `nv` numbers of each."""
+    """How many dofs each dof rides on, and which, its own joint's first: `nv` numbers of each."""
     t = a.topology
     rows: list[list[int]] = []
     for first, (_, size), parent in zip(t.v_start, t.joint_sizes, t.joint_parent, strict=True):
         last = t.v_start[parent - 1] + t.joint_sizes[parent - 1][1] - 1
         carriers = [last, *rows[last]] if parent else []
-        rows += [[*range(first, first + i)] + carriers for i in range(size)]
+        rows += [[*range(first, first + i), *carriers] for i in range(size)]
     return [len(row) for row in rows] + [i for row in rows for i in row + [0] * (t.nv - len(row))]
 
 
 def _nodes(a: Articulation) -> Sequence[Tensor]:
-    """Frames and references of the joints, masses, centres and second moments of all links that ride on each, and the mass that
-    it moves."""
+    """Frames, origins, references and senses of the joints, masses, centres and second moments of all links that ride on each, and
+    the mass that it moves."""
     t = a.topology
     ridden = torch.zeros(t.njoint, 4, 4, dtype=a.dtype)
     for link, node in enumerate(t.link_node):
@@ -163,7 +137,8 @@ def _nodes(a: Articulation) -> Sequence[Tensor]:
     for j in range(t.njoint - 1, 0, -1):
         if t.joint_parent[j] > 0:
             carried[t.joint_parent[j] - 1] += carried[j]
-    return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_ref, mass, center, second, carried
+    sense = torch.ones_like(mass)
+    return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_ref, sense, mass, center, second, carried
 
 
 @dataclass

@@ -25,15 +25,17 @@ template <class V, class N, int D = 3> struct Balance {
   Poses<V> now;
   V *axes, *chord_axes, *chord, *residual, *slopes, *matrix, *turns_;
   Pull<V, D>* pulls;
-  Push<V>* pushes;
+  Push<V, D>* pushes;
   bool* turned;
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D + 3) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V>>(s.nodes) + in_registers<bool>(s.nodes) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
+           in_registers<Push<V, D>>(s.nodes) + in_registers<bool>(s.nodes) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
   }
-  template <class X> static X* taken(Arena<V>& arena, int count) { return reinterpret_cast<X*>(arena.take(in_registers<X>(count))); }
+  template <class X> static X* taken(Arena<V>& arena, int count) {
+    return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
+  }
 
   Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
@@ -43,7 +45,7 @@ template <class V, class N, int D = 3> struct Balance {
     arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), turns_ = arena.take(3 * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
-    pushes = taken<Push<V>>(arena, plan.nodes), turned = taken<bool>(arena, plan.nodes);
+    pushes = taken<Push<V, D>>(arena, plan.nodes), turned = taken<bool>(arena, plan.nodes);
     for (int i = 0; i < plan.nv * plan.nv; i++) matrix[i] = V(0);  // dofs on different branches stay uncoupled
   }
 
@@ -71,7 +73,7 @@ template <class V, class N, int D = 3> struct Balance {
       for (int j = plan.v[k]; j < plan.v[k] + freedoms(plan.kind[k]); j++) {
         const V* s = chord_axes + S * j;
         residual[j] += dot<T>(s, pulls[k].torque) + dot<D>(s + T, pulls[k].force);
-        if (pushes[k].any) residual[j] += worked(axes + S * j, pushes[k].moment, pushes[k].force);
+        if (pushes[k].any) residual[j] += worked<D>(axes + S * j, pushes[k].moment, pushes[k].force);
       }
   }
 
@@ -80,7 +82,7 @@ template <class V, class N, int D = 3> struct Balance {
     if (!curved) let_go(now), pull_all();
     for (int k = 0; k < plan.nodes; k++) {
       const Pull<V, D>& pull = pulls[k];
-      const Push<V>& push = pushes[k];
+      const Push<V, D>& push = pushes[k];
       const V mass = weight * V(plan.carried[k]), *arm = arms + D * k;
       const int first = plan.v[k], last = first + freedoms(plan.kind[k]);
       for (int i = first; i < last; i++)
@@ -128,10 +130,11 @@ template <class V, class N, int D = 3> struct Balance {
         }
         if (curved) within(k, j, push.any ? bent : nullptr, turning);
       }
-      if (plan.kind[k] == BALL || plan.kind[k] == FREE) {
-        if (curved) lose_half_the_torque(k);
-        turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
-      }
+      if constexpr (D == 3)
+        if (plan.kind[k] == BALL || plan.kind[k] == FREE) {
+          if (curved) lose_half_the_torque(k);
+          turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
+        }
     }
     if (!curved) let_go(target), pull_all();
   }

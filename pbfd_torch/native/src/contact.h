@@ -12,92 +12,92 @@ template <class V> struct ContactStep {
   V dt;
 };
 
-template <class V, class N> inline V height(const Plan<N>& plan, int i, Poses<V> at, V* center) {
+template <class V, class N, int D> inline V height(const Plan<N, D>& plan, int i, Poses<V> at, V* center) {
   const int k = plan.carrier[i];
-  times(at.rotation + 9 * k, plan.position + 3 * i, center);
-  for (int j = 0; j < 3; j++) center[j] += at.position[3 * k + j];
-  const N* n = plan.normal + 3 * i;
-  return fma(V(n[0]), center[0], fma(V(n[1]), center[1], V(n[2]) * center[2])) - V(plan.offset[i]);
+  times<D>(at.rotation + D * D * k, plan.position + D * i, center);
+  for (int j = 0; j < D; j++) center[j] += at.position[D * k + j];
+  V sum = V(plan.normal[D * i + D - 1]) * center[D - 1];
+  for (int j = D - 2; j >= 0; j--) sum = fma(V(plan.normal[D * i + j]), center[j], sum);
+  return sum - V(plan.offset[i]);
 }
 
-// Adds the forces on all nodes, and how they answer; `turns` [3] and `turned` per node: room for their rotations over the step.
-template <class V, class N>
-inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> now, Push<V>* pushes, V* turns, bool* turned) {
+// Adds the forces on all nodes, and how they answer; `rolls` [3] and `turned` per node: room for their rotations over the step.
+template <class V, class N, int D>
+inline void contacts(const Plan<N, D>& plan, const ContactStep<V>& step, Poses<V> now, Push<V, D>* pushes, V* rolls, bool* turned) {
+  constexpr int T = turns(D), S = T + D;
   const V zero(0), range = V(plan.release[0]) * step.dt, width = V(plan.slip_speed[0]) * step.dt;
   for (int k = 0; k < plan.nodes; k++) turned[k] = false;
   for (int i = 0; i < plan.candidates; i++) {
-    V c[3], before[3];
+    V c[D], before[D], n[D];
     const V reach = V(plan.radius[i]) + V(plan.margin[i]), depth = reach - height(plan, i, now, c);
     if (!any(depth > zero)) continue;
     const int k = plan.carrier[i];
     const V radius = V(plan.radius[i]), start = reach - height(plan, i, step.start, before);
-    const V n[3] = {V(plan.normal[3 * i]), V(plan.normal[3 * i + 1]), V(plan.normal[3 * i + 2])};
-    V roll[9] = {}, moved[3];
-    const bool round = any(radius > zero);
-    for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
+    V roll[T * T] = {}, moved[D];
+    const bool round = any(plan.radius[i] > N(0));
+    for (int j = 0; j < D; j++) moved[j] = c[j] - before[j], n[j] = V(plan.normal[D * i + j]);
     if (round) {
-      V* phi = turns + 3 * k;
-      if (!turned[k]) rotation_between(now.rotation + 9 * k, step.start.rotation + 9 * k, phi), turned[k] = true;
-      V beside[3];
-      cross(phi, n, beside);
-      for (int j = 0; j < 3; j++) moved[j] = fma(-radius, beside[j], moved[j]);
-      log_jacobian(phi, V(-0.5), roll);
+      V *phi = rolls + 3 * k, beside[D];
+      if (!turned[k]) rotation_between<D>(now.rotation + D * D * k, step.start.rotation + D * D * k, phi), turned[k] = true;
+      swing<D>(phi, n, beside);
+      for (int j = 0; j < D; j++) moved[j] = fma(-radius, beside[j], moved[j]);
+      log_jacobian<D>(phi, V(-0.5), roll);
     }
-    const V lifted = dot(moved, n);
-    V u[3], p[3];
-    for (int j = 0; j < 3; j++) u[j] = fma(-lifted, n[j], moved[j]), p[j] = fma(-radius, n[j], c[j]);
+    const V lifted = dot<D>(moved, n);
+    V u[D], p[D];
+    for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], moved[j]), p[j] = fma(-radius, n[j], c[j]);
     V N_, rises, factor, falls;
     releasing(V(plan.firmness[i]), depth, start, range, N_, rises);
-    const V size = sqrt(dot(u, u)), mu = V(plan.grip[i]);
+    const V size = sqrt(dot<D>(u, u)), mu = V(plan.grip[i]);
     slip_factor(size, width, factor, falls);
     const V drag = mu * N_ * factor, by_depth = mu * rises * factor, by_size = mu * N_ * falls;
-    V f[3];
-    for (int j = 0; j < 3; j++) f[j] = fma(N_, n[j], -(drag * u[j]));
+    V f[D];
+    for (int j = 0; j < D; j++) f[j] = fma(N_, n[j], -(drag * u[j]));
 
     // how the centre, the depth and the slip answer (ω, v): [−[c]× | 1], n · that, and (1 − nnᵀ) of it and of the rolling
-    V sinks[6], slips[18];
-    cross(c, n, sinks);
-    for (int j = 0; j < 3; j++) sinks[3 + j] = n[j];
-    V move[18];
-    const V arm[9] = {zero, c[2], -c[1], -c[2], zero, c[0], c[1], -c[0], zero};
-    for (int a = 0; a < 3; a++)
-      for (int b = 0; b < 3; b++) {
-        move[6 * a + b] = arm[3 * a + b];
-        move[6 * a + 3 + b] = a == b ? V(1) : zero;
-      }
-    if (round)
-      for (int b = 0; b < 3; b++) {
-        const V column[3] = {roll[b], roll[3 + b], roll[6 + b]};
-        V beside[3];
-        cross(n, column, beside);
-        for (int a = 0; a < 3; a++) move[6 * a + b] = fma(radius, beside[a], move[6 * a + b]);
-      }
-    V answer[18], grows[6];
-    for (int b = 0; b < 6; b++) {
-      const V along = fma(n[0], move[b], fma(n[1], move[6 + b], n[2] * move[12 + b]));
-      for (int a = 0; a < 3; a++) slips[6 * a + b] = fma(-along, n[a], move[6 * a + b]);
-      grows[b] = fma(u[0], slips[b], fma(u[1], slips[6 + b], u[2] * slips[12 + b]));
-      const V resists = fma(by_size, grows[b], -(by_depth * sinks[b])), presses = rises * sinks[b];
-      for (int a = 0; a < 3; a++) answer[6 * a + b] = fma(n[a], presses, fma(drag, slips[6 * a + b], u[a] * resists));
+    V sinks[S], move[D * S], answer[D * S];
+    lever<D>(c, n, sinks);
+    for (int j = 0; j < D; j++) sinks[T + j] = n[j];
+    V arm[D * T];
+    arms<D>(c, arm);
+    for (int a = 0; a < D; a++) {
+      for (int b = 0; b < T; b++) move[S * a + b] = arm[T * a + b];
+      for (int b = 0; b < D; b++) move[S * a + T + b] = a == b ? V(1) : zero;
     }
-    Push<V>& out = pushes[k];
+    for (int b = 0; round && b < T; b++) {
+      V column[T], beside[D];
+      for (int a = 0; a < T; a++) column[a] = roll[T * a + b];
+      swing<D>(column, n, beside);
+      for (int a = 0; a < D; a++) move[S * a + b] = fma(-radius, beside[a], move[S * a + b]);
+    }
+    for (int b = 0; b < S; b++) {
+      V column[D];
+      for (int a = 0; a < D; a++) column[a] = move[S * a + b];
+      const V along = dot<D>(n, column);
+      for (int a = 0; a < D; a++) column[a] = fma(-along, n[a], column[a]);
+      const V grows = dot<D>(u, column), resists = fma(by_size, grows, -(by_depth * sinks[b])), presses = rises * sinks[b];
+      for (int a = 0; a < D; a++) answer[S * a + b] = fma(n[a], presses, fma(drag, column[a], u[a] * resists));
+    }
+    Push<V, D>& out = pushes[k];
     out.open();
-    for (int a = 0; a < 3; a++) {
+    for (int a = 0; a < D; a++) {
       out.force[a] -= f[a];
-      for (int b = 0; b < 3; b++) out.moment[3 * a + b] = fma(-f[a], p[b], out.moment[3 * a + b]);
+      for (int b = 0; b < D; b++) out.moment[D * a + b] = fma(-f[a], p[b], out.moment[D * a + b]);
     }
-    for (int b = 0; b < 6; b++) {
-      const V column[3] = {answer[b], answer[6 + b], answer[12 + b]};
-      V torque[3];
-      cross(p, column, torque);
-      for (int a = 0; a < 3; a++) out.stiffness[6 * a + b] += torque[a], out.stiffness[6 * (3 + a) + b] += column[a];
+    for (int b = 0; b < S; b++) {
+      V column[D], torque[T];
+      for (int a = 0; a < D; a++) column[a] = answer[S * a + b];
+      lever<D>(p, column, torque);
+      for (int a = 0; a < T; a++) out.stiffness[S * a + b] += torque[a];
+      for (int a = 0; a < D; a++) out.stiffness[S * (T + a) + b] += column[a];
     }
     if (round) {  // the force does not act on one material point
-      const V pulled = radius * dot(n, f);
-      for (int a = 0; a < 3; a++) {
-        out.stiffness[7 * a] += pulled;
-        for (int b = 0; b < 3; b++) out.stiffness[6 * a + b] = fma(-radius * n[a], f[b], out.stiffness[6 * a + b]);
-      }
+      V pulled[D * D], turning[T * T];
+      for (int a = 0; a < D; a++)
+        for (int b = 0; b < D; b++) pulled[D * a + b] = radius * n[a] * f[b];
+      resistance<D>(pulled, turning);
+      for (int a = 0; a < T; a++)
+        for (int b = 0; b < T; b++) out.stiffness[S * a + b] += turning[T * a + b];
     }
   }
 }

@@ -18,28 +18,29 @@ template <class V> struct Velocities {
   }
 };
 
-template <class V, class N> struct EnergyMomentum {
+template <class V, class N, int D = 3> struct EnergyMomentum {
+  static constexpr int T = turns(D), S = T + D;
   using M = typename Kind<V>::Mask;
-  const Plan<N>& plan;
+  const Plan<N, D>& plan;
   V surplus_allowed;
   V *twist, *rates, *momentum, *impulse, *smooth, *rough, *other, *matrix, *total;
-  Pull<V>* sums;
+  Pull<V, D>* sums;
 
   static int room(Sizes s) {
-    return s.nodes * (6 + 12 + int(sizeof(Pull<V>) / sizeof(V))) + 6 * s.nv + s.nv * s.nv;
+    return s.nodes * (6 + 12 + int(sizeof(Pull<V, D>) / sizeof(V))) + 6 * s.nv + s.nv * s.nv;
   }
-  EnergyMomentum(const Plan<N>& scene, Arena<V>& arena) : plan(scene), surplus_allowed(1e-3) {
+  EnergyMomentum(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), surplus_allowed(1e-3) {
     twist = arena.take(6 * plan.nodes), rates = arena.take(12 * plan.nodes);
     momentum = arena.take(plan.nv), impulse = arena.take(plan.nv), smooth = arena.take(plan.nv), rough = arena.take(plan.nv);
     other = arena.take(plan.nv), total = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
-    sums = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
+    sums = reinterpret_cast<Pull<V, D>*>(arena.take(plan.nodes * int(sizeof(Pull<V, D>) / sizeof(V))));
   }
 
   // At t_n.
   V velocity(const Velocities<V>& x, int i) const { return fma(V(0.5), x.steady[i] + x.lag[i], x.v[i]); }
 
   // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it.
-  M advance(Balance<V, N>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
+  M advance(Balance<V, N, D>& b, const V* q, const Velocities<V>& before, Velocities<V>& after) {
     const int n = plan.nv;
     const V h = b.dt, per = V(1) / h, twice = per + per, zero(0), half(0.5);
     split_forces(b, q);
@@ -49,12 +50,12 @@ template <class V, class N> struct EnergyMomentum {
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions
     pose_rates(plan, b.start, b.start_axes, before.v, twist, rates);
     for (int k = 0; k < plan.nodes; k++) {
-      const V* rate = rates + 12 * k;
-      V next[12];
-      for (int i = 0; i < 9; i++)
-        next[i] = fma(twice, b.now.rotation[9 * k + i] - b.start.rotation[9 * k + i], -rate[i]);
-      for (int i = 0; i < 3; i++)
-        next[9 + i] = fma(twice, b.now.position[3 * k + i] - b.start.position[3 * k + i], -rate[9 + i]);
+      const V* rate = rates + (D * D + D) * k;
+      V next[D * D + D];
+      for (int i = 0; i < D * D; i++)
+        next[i] = fma(twice, b.now.rotation[D * D * k + i] - b.start.rotation[D * D * k + i], -rate[i]);
+      for (int i = 0; i < D; i++)
+        next[D * D + i] = fma(twice, b.now.position[D * k + i] - b.start.position[D * k + i], -rate[D * D + i]);
       pushed(k, b.now, next, sums[k]);
     }
     sum_up();
@@ -62,7 +63,9 @@ template <class V, class N> struct EnergyMomentum {
       impulse[i] = h * rough[i];
       momentum[i] = V(plan.armature[i]) * fma(V(2), after.average[i], -before.v[i]);
     }
-    each_freedom([&](int k, int i) { momentum[i] += dot(b.axes + 6 * i, sums[k].torque) + dot(b.axes + 6 * i + 3, sums[k].force); });
+    each_freedom([&](int k, int i) {
+      momentum[i] += dot<T>(b.axes + S * i, sums[k].torque) + dot<D>(b.axes + S * i + T, sums[k].force);
+    });
     for (int i = 0; i < n; i++) momentum[i] -= h * fma(ahead(i), smooth[i], rough[i]);
 
     masses(b);
@@ -95,19 +98,19 @@ template <class V, class N> struct EnergyMomentum {
     }
     V mass(0), lost(0), flattest(1);
     for (int k = 0; k < plan.nodes; k++) {
-      V x[3], x0[3];
-      times(b.now.rotation + 9 * k, plan.center + 3 * k, x), times(b.start.rotation + 9 * k, plan.center + 3 * k, x0);
+      V x[D], x0[D], middle[D * D];
+      times<D>(b.now.rotation + D * D * k, plan.center + D * k, x), times<D>(b.start.rotation + D * D * k, plan.center + D * k, x0);
       mass += V(plan.mass[k]);
-      for (int i = 0; i < 3; i++) {
-        const V fell = (x[i] + b.now.position[3 * k + i]) - (x0[i] + b.start.position[3 * k + i]);
+      for (int i = 0; i < D; i++) {
+        const V fell = (x[i] + b.now.position[D * k + i]) - (x0[i] + b.start.position[D * k + i]);
         lost = fma(V(plan.mass[k]) * V(plan.gravity[i]), fell, lost);
       }
-      V middle[9];
-      for (int i = 0; i < 9; i++) middle[i] = half * (b.now.rotation[9 * k + i] + b.start.rotation[9 * k + i]);
-      flattest = min(flattest, determinant(middle));
+      for (int i = 0; i < D * D; i++) middle[i] = half * (b.now.rotation[D * D * k + i] + b.start.rotation[D * D * k + i]);
+      flattest = min(flattest, determinant<D>(middle));
     }
-    const V g[3] = {V(plan.gravity[0]), V(plan.gravity[1]), V(plan.gravity[2])};
-    const V strength = max(sqrt(dot(g, g)), V(1)), falls = half * mass * (h * strength) * (h * strength);
+    V g[D];
+    for (int i = 0; i < D; i++) g[i] = V(plan.gravity[i]);
+    const V strength = max(sqrt(dot<D>(g, g)), V(1)), falls = half * mass * (h * strength) * (h * strength);
     after.gained = last - first - lost - work;
     after.peak = max(before.peak, max(first, last) + falls);
     after.surplus = max(before.surplus + after.gained, V(-RESERVE) * after.peak);
@@ -126,44 +129,38 @@ template <class V, class N> struct EnergyMomentum {
     for (int k = 0; k < plan.nodes; k++)
       for (int i = plan.v[k]; i < plan.v[k] + freedoms(plan.kind[k]); i++) visit(k, i);
   }
-  static V determinant(const V* M) {
-    V c[3];
-    cross(M + 3, M + 6, c);
-    return dot(M, c);
-  }
-
   // Generalised forces of contacts, limits and dry friction, and of what is `Fitted`, as if taken whole.
-  void split_forces(const Balance<V, N>& b, const V* q) {
+  void split_forces(const Balance<V, N, D>& b, const V* q) {
     const JointStep<V> step = b.steps();
     for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = other[i] = V(0);  // slopes are not asked for
     joint_loads<SMOOTH>(plan, step, q, smooth, other);
     joint_loads<ROUGH>(plan, step, q, rough, other);
     each_freedom([&](int k, int i) {
-      if (b.pushes[k].any) rough[i] += worked(b.axes + 6 * i, b.pushes[k].moment, b.pushes[k].force);
+      if (b.pushes[k].any) rough[i] += worked<D>(b.axes + S * i, b.pushes[k].moment, b.pushes[k].force);
     });
     for (int i = 0; i < plan.nv; i++) smooth[i] = -smooth[i] / V(plan.share[i]), rough[i] = -rough[i];
   }
 
   // The moment of the momenta of a node whose pose changes at `rate`.
-  void pushed(int k, Poses<V> at, const V* rate, Pull<V>& out) const {
-    const N *center = plan.center + 3 * k, *second = plan.second + 9 * k;
-    const V *R = at.rotation + 9 * k, mass = V(plan.mass[k]);
-    V spread[9], moment[9], x[3], speed[3];
-    product(rate, second, spread);
-    product_transposed(spread, R, moment);
-    times(R, center, x), times(rate, center, speed);
-    for (int i = 0; i < 3; i++) {
-      x[i] += at.position[3 * k + i];
-      out.force[i] = mass * (speed[i] + rate[9 + i]), out.first[i] = mass * x[i];
+  void pushed(int k, Poses<V> at, const V* rate, Pull<V, D>& out) const {
+    const N *center = plan.center + D * k, *second = plan.second + D * D * k;
+    const V *R = at.rotation + D * D * k, mass = V(plan.mass[k]);
+    V spread[D * D], moment[D * D], x[D], speed[D], torque[T];
+    product<D>(rate, second, spread);
+    product_transposed<D>(spread, R, moment);
+    times<D>(R, center, x), times<D>(rate, center, speed);
+    for (int i = 0; i < D; i++) {
+      x[i] += at.position[D * k + i];
+      out.force[i] = mass * (speed[i] + rate[D * D + i]), out.first[i] = mass * x[i];
     }
-    curl<3>(moment, out.torque);
-    add_cross(x, out.force, out.torque);
+    curl<D>(moment, out.torque), lever<D>(x, out.force, torque);
+    for (int i = 0; i < T; i++) out.torque[i] += torque[i];
     // beside it, what the mass matrix needs
-    product(R, second, spread);
-    product_transposed(spread, R, moment);
-    for (int i = 0; i < 3; i++)
-      for (int j = 0; j < 3; j++) moment[3 * i + j] = fma(out.first[i], x[j], moment[3 * i + j]);
-    resistance<3>(moment, out.turning);
+    product<D>(R, second, spread);
+    product_transposed<D>(spread, R, moment);
+    for (int i = 0; i < D; i++)
+      for (int j = 0; j < D; j++) moment[D * i + j] = fma(out.first[i], x[j], moment[D * i + j]);
+    resistance<D>(moment, out.turning);
     out.any = true;
   }
   void sum_up() {
@@ -175,31 +172,29 @@ template <class V, class N> struct EnergyMomentum {
     pose_rates(plan, at, axes, v, twist, rates);
     V twice(0);
     for (int k = 0; k < plan.nodes; k++) {
-      const V* rate = rates + 12 * k;
-      V spread[9], speed[3];
-      product(rate, plan.second + 9 * k, spread);
-      for (int i = 0; i < 9; i++) twice = fma(spread[i], rate[i], twice);
-      times(rate, plan.center + 3 * k, speed);
-      for (int i = 0; i < 3; i++) speed[i] += rate[9 + i];
-      twice = fma(V(plan.mass[k]), dot(speed, speed), twice);
+      const V* rate = rates + (D * D + D) * k;
+      V spread[D * D], speed[D];
+      product<D>(rate, plan.second + D * D * k, spread);
+      for (int i = 0; i < D * D; i++) twice = fma(spread[i], rate[i], twice);
+      times<D>(rate, plan.center + D * k, speed);
+      for (int i = 0; i < D; i++) speed[i] += rate[D * D + i];
+      twice = fma(V(plan.mass[k]), dot<D>(speed, speed), twice);
     }
     for (int i = 0; i < plan.nv; i++) twice = fma(V(plan.armature[i]) * v[i], v[i], twice);
     return V(0.5) * twice;
   }
 
   // M [nv × nv] at the end of the step.
-  void masses(const Balance<V, N>& b) {
+  void masses(const Balance<V, N, D>& b) {
     const int n = plan.nv;
     for (int i = 0; i < n * n; i++) matrix[i] = V(0);
     each_freedom([&](int k, int j) {
-      const Pull<V>& p = sums[k];
-      V below[6];
-      answer(p, V(plan.carried[k]), p.first, b.axes + 6 * j, below);
+      const Pull<V, D>& p = sums[k];
+      V below[S];
+      answer(p, V(plan.carried[k]), p.first, b.axes + S * j, below);
       for (int up = k; up >= 0; up = plan.parent[up])
-        for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++) {
-          const V* t = b.axes + 6 * i;
-          matrix[i * n + j] = matrix[j * n + i] = dot(t, below) + dot(t + 3, below + 3);
-        }
+        for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++)
+          matrix[i * n + j] = matrix[j * n + i] = dot<S>(b.axes + S * i, below);
       matrix[j * n + j] += V(plan.armature[j]);
     });
   }

@@ -1,7 +1,7 @@
 // Inertia and gravity of the links, pulled to the integrator's target poses (Eq. 5), as terms/inertia.py.
 //
-// Points p, pulled to p̂ by f = κ m (p − p̂), work on the chord of the step, at p̄ = p₀ + w (p − p₀); w = 1 is the paper's, at the end
-// of the step. When p moves, p̄ × f changes by κ m p̄ × δp + w δp × f = κ m p̃ × δp, where p̃ = p₀ + w (p̂ − p₀) does not move.
+// Points p, pulled to p̂ by f = κ m (p − p̂), work on the chord of the step, at p̄ = p₀ + w (p − p₀); w = 1 is the paper's, at the
+// end of the step. When p moves, p̄ × f changes by κ m p̄ × δp + w δp × f = κ m p̃ × δp, where p̃ = p₀ + w (p̂ − p₀) does not move.
 #pragma once
 #include "loads.h"
 

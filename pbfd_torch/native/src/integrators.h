@@ -4,46 +4,49 @@
 
 namespace pbfd {
 
-// Twists (ω, v at the world's origin) of all nodes, [6] each, that move with v [nv] about these axes.
-template <class V, class N> inline void twists(const Plan<N>& plan, const V* axes, const V* v, V* out) {
+// Twists (ω, v at the world's origin) of all nodes that move with v [nv] about these axes.
+template <class V, class N, int D> inline void twists(const Plan<N, D>& plan, const V* axes, const V* v, V* out) {
+  constexpr int S = turns(D) + D;
   for (int k = 0; k < plan.nodes; k++) {
-    for (int a = 0; a < 6; a++) out[6 * k + a] = plan.parent[k] < 0 ? V(0) : out[6 * plan.parent[k] + a];
+    for (int a = 0; a < S; a++) out[S * k + a] = plan.parent[k] < 0 ? V(0) : out[S * plan.parent[k] + a];
     for (int j = plan.v[k]; j < plan.v[k] + freedoms(plan.kind[k]); j++)
-      for (int a = 0; a < 6; a++) out[6 * k + a] = fma(v[j], axes[6 * j + a], out[6 * k + a]);
+      for (int a = 0; a < S; a++) out[S * k + a] = fma(v[j], axes[S * j + a], out[S * k + a]);
   }
 }
 
-// How fast all poses change that move with v [nv]: Ṫ = [V] T, rotation [9] and position [3] each. twist: room, [6] each.
-template <class V, class N> inline void pose_rates(const Plan<N>& plan, Poses<V> at, const V* axes, const V* v, V* twist, V* out) {
+// How fast all poses change that move with v [nv]: Ṫ = [V] T, rotation and position. twist: room, [6] each.
+template <class V, class N, int D>
+inline void pose_rates(const Plan<N, D>& plan, Poses<V> at, const V* axes, const V* v, V* twist, V* out) {
+  constexpr int T = turns(D), S = T + D;
   twists(plan, axes, v, twist);
-  for (int k = 0; k < plan.nodes; k++, out += 12) {
-    const V *w = twist + 6 * k, *R = at.rotation + 9 * k;
-    for (int j = 0; j < 3; j++) {
-      const V column[3] = {R[j], R[3 + j], R[6 + j]};
-      V moved[3];
-      cross(w, column, moved);
-      for (int i = 0; i < 3; i++) out[3 * i + j] = moved[i];
+  for (int k = 0; k < plan.nodes; k++, out += D * D + D) {
+    const V *w = twist + S * k, *R = at.rotation + D * D * k;
+    for (int j = 0; j < D; j++) {
+      V column[D], moved[D];
+      for (int i = 0; i < D; i++) column[i] = R[D * i + j];
+      swing<D>(w, column, moved);
+      for (int i = 0; i < D; i++) out[D * i + j] = moved[i];
     }
-    cross(w, at.position + 3 * k, out + 9);
-    for (int i = 0; i < 3; i++) out[9 + i] += w[3 + i];
+    swing<D>(w, at.position + D * k, out + D * D);
+    for (int i = 0; i < D; i++) out[D * D + i] += w[T + i];
   }
 }
 
 // T̂ = T_n + Δt V_n + a [0 | g]: poses moved along the velocity v, and fallen. room: [18] per node.
-template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall, V* room) {
-  const Plan<N>& plan = b.plan;
+template <class V, class N, int D> inline void aim(Balance<V, N, D>& b, const V* v, V fall, V* room) {
+  const Plan<N, D>& plan = b.plan;
   const V* rate = room + 6 * plan.nodes;
   pose_rates(plan, b.start, b.start_axes, v, room, room + 6 * plan.nodes);
-  for (int k = 0; k < plan.nodes; k++, rate += 12) {
-    for (int i = 0; i < 9; i++) b.target.rotation[9 * k + i] = fma(b.dt, rate[i], b.start.rotation[9 * k + i]);
-    for (int i = 0; i < 3; i++)
-      b.target.position[3 * k + i] = fma(fall, V(plan.gravity[i]), fma(b.dt, rate[9 + i], b.start.position[3 * k + i]));
+  for (int k = 0; k < plan.nodes; k++, rate += D * D + D) {
+    for (int i = 0; i < D * D; i++) b.target.rotation[D * D * k + i] = fma(b.dt, rate[i], b.start.rotation[D * D * k + i]);
+    for (int i = 0; i < D; i++)
+      b.target.position[D * k + i] = fma(fall, V(plan.gravity[i]), fma(b.dt, rate[D * D + i], b.start.position[D * k + i]));
   }
 }
 
 // The energy–momentum step from q_n with v_n: κ = 1/Δt², T̂ = T_n + Δt V_n + ½ Δt² [0 | g], inertia in the middle of the chord.
 // room: 18 per node.
-template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, const V* q, const V* v, V* room) {
+template <class V, class N, int D> inline void begin_energy_momentum(Balance<V, N, D>& b, const V* q, const V* v, V* room) {
   for (int i = 0; i < b.plan.nq; i++) b.q_start[i] = q[i];
   place(b.plan, q, b.start, b.start_axes);
   b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5);

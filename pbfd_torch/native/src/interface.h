@@ -12,10 +12,10 @@ PBFD_FUNCTION int pbfd_lanes(int bytes);
 // The kind of processor that the library is compiled for: "x86-64-v4", ...
 PBFD_FUNCTION const char* pbfd_target();
 
-// A scene as plan.h reads it. Scalars are of 8 or 4 bytes, those of all arrays below too; `each`: every world has its own numbers,
+// A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too; `each`: every world has its own numbers,
 // [worlds, count].
 struct pbfd_plan {
-  int bytes, each, nodes, nq, nv, nu, candidates;
+  int bytes, dimension, each, nodes, nq, nv, nu, candidates;
   const int* whole;
   const void* real;
 };

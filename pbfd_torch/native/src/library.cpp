@@ -16,11 +16,11 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
 
-template <class V, class N> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
   Arena<V> arena{static_cast<V*>(room)};
-  Scenery<V, N> scenery(sizes(p), p->whole, static_cast<const T*>(p->real), arena);
-  Machine<V, N> machine(scenery, arena);
+  Scenery<V, N, D> scenery(sizes(p), p->whole, static_cast<const T*>(p->real), arena);
+  Machine<V, N, D> machine(scenery, arena);
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
   const Journey<T> journey{
@@ -33,16 +33,16 @@ template <class V, class N> void energy_momentum(const pbfd_plan* p, const pbfd_
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class T, int D> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using V = Lanes<T, register_bytes / int(sizeof(T))>;
   if (s->last - s->first == 1) {
     pbfd_plan own = *p;
-    if (p->each) own.real = static_cast<const T*>(p->real) + long(s->first) * Plan<T>::real_numbers(sizes(p));
-    energy_momentum<T, T>(&own, s, room);
+    if (p->each) own.real = static_cast<const T*>(p->real) + long(s->first) * Plan<T, D>::real_numbers(sizes(p));
+    energy_momentum<T, T, D>(&own, s, room);
   } else if (p->each) {
-    energy_momentum<V, V>(p, s, room);
+    energy_momentum<V, V, D>(p, s, room);
   } else {
-    energy_momentum<V, T>(p, s, room);
+    energy_momentum<V, T, D>(p, s, room);
   }
 }
 
@@ -50,7 +50,9 @@ template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps*
 
 long pbfd_whole_numbers(const pbfd_plan* p) { return Plan<double>::whole_numbers(sizes(p)); }
 
-long pbfd_real_numbers(const pbfd_plan* p) { return Plan<double>::real_numbers(sizes(p)); }
+long pbfd_real_numbers(const pbfd_plan* p) {
+  return p->dimension == 3 ? Plan<double>::real_numbers(sizes(p)) : Plan<double, 2>::real_numbers(sizes(p));
+}
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
@@ -62,5 +64,9 @@ long pbfd_room(const pbfd_plan* p) {
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  p->bytes == 8 ? energy_momentum_of<double>(p, s, room) : energy_momentum_of<float>(p, s, room);
+  const bool plane = p->dimension == 2;
+  if (p->bytes == 8)
+    plane ? energy_momentum_of<double, 2>(p, s, room) : energy_momentum_of<double, 3>(p, s, room);
+  else
+    plane ? energy_momentum_of<float, 2>(p, s, room) : energy_momentum_of<float, 3>(p, s, room);
 }

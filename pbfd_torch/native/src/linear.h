@@ -6,7 +6,7 @@
 namespace pbfd {
 
 // Factors `matrix` [nv × nv] in place, the pivots' inverses on its diagonal; the sign of its determinant.
-template <class V, class N> inline V factor_along_the_tree(const Plan<N>& plan, V* matrix) {
+template <class V, class N, int D> inline V factor_along_the_tree(const Plan<N, D>& plan, V* matrix) {
   const int n = plan.nv;
   V sign(1);
   for (int j = n - 1; j >= 0; j--) {
@@ -26,7 +26,7 @@ template <class V, class N> inline V factor_along_the_tree(const Plan<N>& plan, 
 }
 
 // x ← matrix⁻¹ x by the factors.
-template <class V, class N> inline void substitute_along_the_tree(const Plan<N>& plan, const V* matrix, V* x) {
+template <class V, class N, int D> inline void substitute_along_the_tree(const Plan<N, D>& plan, const V* matrix, V* x) {
   const int n = plan.nv;
   for (int j = n - 1; j >= 0; j--) {
     const int* above = plan.above + n * j;

@@ -8,9 +8,10 @@
 namespace pbfd {
 
 // ω · (Σ p × f) + v · Σ f of minus the forces: the virtual work along a unit twist s.
-template <class V> inline V worked(const V* s, const V* moment, const V* force) {
-  const V torque[3] = {moment[7] - moment[5], moment[2] - moment[6], moment[3] - moment[1]};
-  return dot(s, torque) + dot(s + 3, force);
+template <int D, class V> inline V worked(const V* s, const V* moment, const V* force) {
+  V torque[turns(D)];
+  curl<D>(moment, torque);
+  return dot<turns(D)>(s, torque) + dot<D>(s + turns(D), force);
 }
 
 // Inertial loads of a node, about the world's origin.
@@ -55,9 +56,10 @@ template <class V, int D> inline void answer_above(const Pull<V, D>& p, V mass, 
 }
 
 // Contact loads of a node.
-template <class V> struct Push {
-  V moment[9], force[3];
-  V stiffness[36];
+template <class V, int D = 3> struct Push {
+  static constexpr int S = turns(D) + D;
+  V moment[D * D], force[D];
+  V stiffness[S * S];
   bool any;  // in some lane
 
   // Nothing is there until something touches: most nodes of most steps are spared the zeros.
@@ -69,10 +71,13 @@ template <class V> struct Push {
     any = true;
   }
   void add(const Push& o) {
-    open();
-    for (int i = 0; i < 9; i++) moment[i] += o.moment[i];
-    for (int i = 0; i < 3; i++) force[i] += o.force[i];
-    for (int i = 0; i < 36; i++) stiffness[i] += o.stiffness[i];
+    if (!any) {
+      *this = o;
+      return;
+    }
+    for (int i = 0; i < D * D; i++) moment[i] += o.moment[i];
+    for (int i = 0; i < D; i++) force[i] += o.force[i];
+    for (int i = 0; i < S * S; i++) stiffness[i] += o.stiffness[i];
   }
 };
 

@@ -21,22 +21,22 @@ template <class T> struct Journey {
   int *status, *evaluations, *iterations, *refused, *hazards;
 };
 
-template <class V, class N> struct Machine {
+template <class V, class N, int D = 3> struct Machine {
   using T = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   static constexpr int W = Kind<V>::lanes;
 
-  const Plan<N>& plan;
-  Newton<V, N> newton;
-  EnergyMomentum<V, N> scheme;
+  const Plan<N, D>& plan;
+  Newton<V, N, D> newton;
+  EnergyMomentum<V, N, D> scheme;
   Velocities<V> before, after;
   V *q, *guess, *velocity, *room_to_begin;
-  Scenery<V, N>& scenery;
+  Scenery<V, N, D>& scenery;
 
   static int room(Sizes s) {
-    return Newton<V, N>::room(s) + EnergyMomentum<V, N>::room(s) + 11 * s.nv + 2 * s.nq + 18 * s.nodes;
+    return Newton<V, N, D>::room(s) + EnergyMomentum<V, N, D>::room(s) + 11 * s.nv + 2 * s.nq + 18 * s.nodes;
   }
-  Machine(Scenery<V, N>& scenes, Arena<V>& arena)
+  Machine(Scenery<V, N, D>& scenes, Arena<V>& arena)
       : plan(scenes.plan), newton(plan, arena), scheme(plan, arena), before(Velocities<V>::in(arena, plan)),
         after(Velocities<V>::in(arena, plan)), scenery(scenes) {
     q = arena.take(plan.nq), guess = arena.take(plan.nq), velocity = arena.take(plan.nv);
@@ -97,7 +97,7 @@ template <class V, class N> struct Machine {
   // Lanes set out on their step: those on their way find the same again.
   void set_out(M fresh) {
     if (!any(fresh)) return;
-    Balance<V, N>& b = newton.balance;
+    Balance<V, N, D>& b = newton.balance;
     for (int i = 0; i < plan.nv; i++) velocity[i] = scheme.velocity(before, i);
     const M fits = near(q, plan.nq) & slow(plan, velocity, b.dt) & finite(b.control, plan.nu);
     able = (able & !fresh) | (fits & fresh);
@@ -169,14 +169,14 @@ template <class V, class N> struct Machine {
 
   // What is too deep, and who touches something and has turned by more than a quarter turn (contact/hazards.py).
   void look_for_hazards(M& deep, M& far) const {
-    const Balance<V, N>& b = newton.balance;
+    const Balance<V, N, D>& b = newton.balance;
     deep = far = M(false);
     for (int i = 0; i < plan.candidates; i++) {
       const int k = plan.carrier[i];
-      V c[3], turned(0);
+      V c[D], turned(0);
       const V depth = V(plan.radius[i]) + V(plan.margin[i]) - height(plan, i, b.now, c);
-      for (int j = 0; j < 9; j++) turned = fma(b.now.rotation[9 * k + j], b.start.rotation[9 * k + j], turned);
-      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(1)));
+      for (int j = 0; j < D * D; j++) turned = fma(b.now.rotation[D * D * k + j], b.start.rotation[D * D * k + j], turned);
+      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(D - 2)));
     }
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;

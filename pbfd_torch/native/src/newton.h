@@ -14,14 +14,14 @@ constexpr double MAX_TURN = 1.0;       // [rad] of a joint in one step of Newton
 
 enum Status { SOLVED = 0, STALLED = 5, ITERATION_LIMIT = 6, NON_FINITE = 7 };  // as solvers/objective.py
 
-template <class V, class N> struct Newton {
+template <class V, class N, int D = 3> struct Newton {
   using T = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   static constexpr T EPSILON = sizeof(T) == 8 ? T(DBL_EPSILON) : T(FLT_EPSILON);
 
-  const Plan<N>& plan;
-  Balance<V, N> balance;
-  Outlook<V, N> outlook;
+  const Plan<N, D>& plan;
+  Balance<V, N, D> balance;
+  Outlook<V, N, D> outlook;
   V tolerance, most;  // ‖r/scale‖; evaluations
   // where every lane stands
   V *q, *trial, *retreat, *direction, *step, *column, *diagonal;
@@ -31,9 +31,9 @@ template <class V, class N> struct Newton {
   M running, at_guess, at_retreat, searching;
   bool settled;  // every lane that does not run has been evaluated where it stays
 
-  static int room(Sizes s) { return Balance<V, N>::room(s) + Outlook<V, N>::room(s) + 3 * s.nq + 5 * s.nv; }
+  static int room(Sizes s) { return Balance<V, N, D>::room(s) + Outlook<V, N, D>::room(s) + 3 * s.nq + 5 * s.nv; }
 
-  Newton(const Plan<N>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
+  Newton(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
     q = arena.take(plan.nq), trial = arena.take(plan.nq), retreat = arena.take(plan.nq);
     direction = arena.take(plan.nv), step = arena.take(plan.nv), column = arena.take(plan.nv), diagonal = arena.take(plan.nv);
     allowed = arena.take(plan.nv);
@@ -50,7 +50,7 @@ template <class V, class N> struct Newton {
       retreat[i] = select(which, balance.q_start[i], retreat[i]);
     }
     V farthest(0);
-    for (int i = 0; i < 3 * plan.nodes; i++) farthest = max(farthest, abs(balance.start.position[i]));
+    for (int i = 0; i < D * plan.nodes; i++) farthest = max(farthest, abs(balance.start.position[i]));
     far = select(which, farthest + V(plan.reach[0]), far);
     const V per = V(8 * EPSILON) * balance.weight / tolerance;
     for (int i = 0; i < plan.nv; i++)

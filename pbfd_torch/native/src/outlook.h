@@ -15,7 +15,8 @@ template <class V> struct Stop {
   V past, speed, start, stiffness;
 };
 
-template <class V, class N> struct Outlook {
+template <class V, class N, int D = 3> struct Outlook {
+  static constexpr int T = turns(D), S = T + D;
   Coming<V>* coming;
   Stop<V>* stops;
   V *twist, *drift;  // [6] per node
@@ -33,8 +34,8 @@ template <class V, class N> struct Outlook {
   }
 
   // Along d from q, where the work is `work` and its slope dᵀJd is `curve`. `where`: for which lanes it counts.
-  void look(const Balance<V, N>& b, const V* q, const V* d, V work, V curve, typename Kind<V>::Mask where) {
-    const Plan<N>& plan = b.plan;
+  void look(const Balance<V, N, D>& b, const V* q, const V* d, V work, V curve, typename Kind<V>::Mask where) {
+    const Plan<N, D>& plan = b.plan;
     const V zero(0);
     base = work, slope = curve, contacts = limits = 0;
     range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt, limit_range = V(plan.limit_release[0]) * b.dt;
@@ -42,41 +43,41 @@ template <class V, class N> struct Outlook {
     drifts(plan, b.axes, d);
     for (int i = 0; i < plan.candidates; i++) {
       const int k = plan.carrier[i];
-      V c[3], before[3], n[3];
+      V c[D], before[D], n[D];
       const V radius = V(plan.radius[i]), reach = radius + V(plan.margin[i]);
       const V depth = reach - height(plan, i, b.now, c);
-      for (int j = 0; j < 3; j++) n[j] = V(plan.normal[3 * i + j]);
-      const V *t = twist + 6 * k, *e = drift + 6 * k;
-      V v[3], a[3];
-      cross(t, c, v);
-      for (int j = 0; j < 3; j++) v[j] += t[3 + j];
-      cross(e, c, a);
-      for (int j = 0; j < 3; j++) a[j] += e[3 + j];
-      add_cross(t, v, a);
-      const V sinks = -dot(v, n), faster = -dot(a, n);
+      for (int j = 0; j < D; j++) n[j] = V(plan.normal[D * i + j]);
+      const V *t = twist + S * k, *e = drift + S * k;
+      V v[D], a[D], bent[D];
+      swing<D>(t, c, v), swing<D>(e, c, a);
+      for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
+      swing<D>(t, v, bent);
+      for (int j = 0; j < D; j++) a[j] += bent[j];
+      const V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
       if (!any((depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) continue;
       Coming<V>& out = coming[contacts++];
       out.depth = depth, out.start = reach - height(plan, i, b.start, before), out.sinks = sinks, out.faster = faster;
       out.stiffness = V(plan.firmness[i]), out.mu = V(plan.grip[i]);
-      V moved[3], first[3], second[3];
-      for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
-      if (any(radius > zero)) {  // the surface moves by φ × s beside its centre, s = −ρ n
-        V phi[3], beside[3];
-        rotation_between(b.now.rotation + 9 * k, b.start.rotation + 9 * k, phi);
-        cross(phi, n, beside);
-        for (int j = 0; j < 3; j++) moved[j] = fma(-radius, beside[j], moved[j]);
-        cross(t, n, beside);
-        for (int j = 0; j < 3; j++) v[j] = fma(-radius, beside[j], v[j]);
-        cross(e, n, beside);
-        for (int j = 0; j < 3; j++) a[j] = fma(-radius, beside[j], a[j]);
+      V moved[D], first[D], second[D];
+      for (int j = 0; j < D; j++) moved[j] = c[j] - before[j];
+      if (any(plan.radius[i] > N(0))) {  // the surface moves by φ × s beside its centre, s = −ρ n
+        V phi[T], beside[D];
+        rotation_between<D>(b.now.rotation + D * D * k, b.start.rotation + D * D * k, phi);
+        swing<D>(phi, n, beside);
+        for (int j = 0; j < D; j++) moved[j] = fma(-radius, beside[j], moved[j]);
+        swing<D>(t, n, beside);
+        for (int j = 0; j < D; j++) v[j] = fma(-radius, beside[j], v[j]);
+        swing<D>(e, n, beside);
+        for (int j = 0; j < D; j++) a[j] = fma(-radius, beside[j], a[j]);
       }
-      const V lifted = dot(moved, n);
-      for (int j = 0; j < 3; j++) {
+      const V lifted = dot<D>(moved, n);
+      for (int j = 0; j < D; j++) {
         moved[j] = fma(-lifted, n[j], moved[j]);
         first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
       }
-      out.size = dot(moved, moved), out.along = dot(moved, first);
-      out.square = dot(first, first) + dot(moved, second), out.cube = dot(first, second), out.fourth = dot(second, second);
+      out.size = dot<D>(moved, moved), out.along = dot<D>(moved, first);
+      out.square = dot<D>(first, first) + dot<D>(moved, second), out.cube = dot<D>(first, second);
+      out.fourth = dot<D>(second, second);
       V df;
       base -= of_contact(out, zero, df);
       slope -= df;
@@ -108,26 +109,24 @@ template <class V, class N> struct Outlook {
 
  private:
   // V̇ = Σ ṡ_i d_i, ṡ_i = ad(V_carrier) s_i, of all nodes.
-  void drifts(const Plan<N>& plan, const V* axes, const V* d) {
+  void drifts(const Plan<N, D>& plan, const V* axes, const V* d) {
     for (int k = 0; k < plan.nodes; k++) {
-      V carrier[6];
-      for (int a = 0; a < 6; a++) {
-        carrier[a] = plan.parent[k] < 0 ? V(0) : twist[6 * plan.parent[k] + a];
-        drift[6 * k + a] = plan.parent[k] < 0 ? V(0) : drift[6 * plan.parent[k] + a];
+      V carrier[S];
+      for (int a = 0; a < S; a++) {
+        carrier[a] = plan.parent[k] < 0 ? V(0) : twist[S * plan.parent[k] + a];
+        drift[S * k + a] = plan.parent[k] < 0 ? V(0) : drift[S * plan.parent[k] + a];
       }
-      const int first = plan.v[k], last = first + freedoms(plan.kind[k]);
-      if (plan.kind[k] == FREE)  // its translation carries its rotation
-        for (int a = 0; a < 3; a++) carrier[3 + a] += d[first + a];
-      for (int j = first; j < last; j++) {
-        if (plan.kind[k] == FREE && j < first + 3) continue;
-        const V* s = axes + 6 * j;
-        V turned[3], moved[3];
-        cross(carrier, s, turned);
-        cross(carrier, s + 3, moved);
-        add_cross(carrier + 3, s, moved);
-        for (int a = 0; a < 3; a++) {
-          drift[6 * k + a] = fma(d[j], turned[a], drift[6 * k + a]);
-          drift[6 * k + 3 + a] = fma(d[j], moved[a], drift[6 * k + 3 + a]);
+      const int first = plan.v[k], last = first + freedoms(plan.kind[k]), rotation = plan.kind[k] == FREE ? first + 3 : first;
+      for (int j = first; j < rotation; j++) carrier[T + j - first] += d[j];  // its translation carries its rotation
+      for (int j = rotation; j < last; j++) {
+        const V* s = axes + S * j;
+        V moved[D], back[D];
+        swing<D>(carrier, s + T, moved), swing<D>(s, carrier + T, back);
+        for (int a = 0; a < D; a++) drift[S * k + T + a] = fma(d[j], moved[a] - back[a], drift[S * k + T + a]);
+        if constexpr (D == 3) {
+          V turned[3];
+          cross(carrier, s, turned);
+          for (int a = 0; a < 3; a++) drift[S * k + a] = fma(d[j], turned[a], drift[S * k + a]);
         }
       }
     }

@@ -1,4 +1,5 @@
-// A scene as the core sees it: a tree of nodes (joints), what acts on its degrees of freedom, and contact candidates.
+// A scene as the core sees it: a tree of nodes (joints), what acts on its degrees of freedom, and contact candidates. What moves in
+// a plane only (hinges and slides, D = 2) is spared the third dimension: the same mechanics with fewer numbers.
 //
 // The numbers are those of all worlds (N a scalar) or every world's own (N like V). `Plan` walks once over two arrays that
 // native/plan.py has written in this order: this file and that one change together.
@@ -20,9 +21,9 @@ template <class N, int D = 3> struct Plan : Sizes {
   // nodes, parents first; −1: the world
   const int *parent, *kind, *q, *v;
   const int* plain;  // 1 where its frame is turned as the parent's
-  const N *frame, *origin;  // [9], [3] on the parent at the joint's reference: hinges turn about its z, slides move along it
-  const N* reference;
-  const N *mass, *center, *second;  // [1], [3], [9] ∫ρ (x − c)(x − c)ᵀ of all links on the node, in its frame
+  const N *frame, *origin;  // [D × D], [D] on the parent at the joint's reference; slides move along its last axis
+  const N *reference, *sense;  // hinges turn about z; in a plane, ahead or back: ±1
+  const N *mass, *center, *second;  // [1], [D], [D × D] ∫ρ (x − c)(x − c)ᵀ of all links on the node, in its frame
   const N* carried;  // mass of it and of all that it moves
   // degrees of freedom
   const int *depth, *above;  // how many others a dof rides on, and which: [nv] each, the nearest first
@@ -37,10 +38,10 @@ template <class N, int D = 3> struct Plan : Sizes {
   const N *gear, *gain, *bias, *stiffness, *resistance, *least_control, *most_control, *least_force, *most_force;
   // contact candidates, each against one half-space
   const int* carrier;  // node
-  const N *position, *radius, *margin, *firmness, *grip, *normal, *offset;  // [3] on the node, …, [3] in the world
+  const N *position, *radius, *margin, *firmness, *grip, *normal, *offset;  // [D] on the node, …, [D] in the world
   const N *deep;  // from which depth on it is a hazard
   // the scene
-  const N *gravity;  // [3]
+  const N *gravity;  // [D]
   const N *reach;    // [m]
   const N *release, *slip_speed, *limit_release, *dry_speed;
 
@@ -52,20 +53,22 @@ template <class N, int D = 3> struct Plan : Sizes {
     depth = whole(nv), above = whole(nv * nv);
     actuated_q = whole(nu), actuated_v = whole(nu);
     carrier = whole(candidates);
-    frame = real(9 * nodes), origin = real(3 * nodes), reference = real(nodes);
-    mass = real(nodes), center = real(3 * nodes), second = real(9 * nodes), carried = real(nodes);
+    frame = real(D * D * nodes), origin = real(D * nodes), reference = real(nodes), sense = real(nodes);
+    mass = real(nodes), center = real(D * nodes), second = real(D * D * nodes), carried = real(nodes);
     scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
     spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
-    position = real(3 * candidates), radius = real(candidates), margin = real(candidates), firmness = real(candidates);
-    grip = real(candidates), normal = real(3 * candidates), offset = real(candidates), deep = real(candidates);
-    gravity = real(3), reach = real(1), release = real(1), slip_speed = real(1), limit_release = real(1), dry_speed = real(1);
+    position = real(D * candidates), radius = real(candidates), margin = real(candidates), firmness = real(candidates);
+    grip = real(candidates), normal = real(D * candidates), offset = real(candidates), deep = real(candidates);
+    gravity = real(D), reach = real(1), release = real(1), slip_speed = real(1), limit_release = real(1), dry_speed = real(1);
   }
 
   static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.candidates; }
-  static int real_numbers(Sizes s) { return 27 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 12 * s.candidates + 8; }
+  static int real_numbers(Sizes s) {
+    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + (6 + 2 * D) * s.candidates + D + 5;
+  }
 };
 
 // Memory that the caller owns, handed out piece by piece.

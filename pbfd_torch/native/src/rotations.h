@@ -109,18 +109,18 @@ template <class V> inline void quaternion_log(const V* q, V* v) {
   for (int i = 0; i < 3; i++) v[i] = scale * q[1 + i];
 }
 
-// log of A Bᵀ, both rotation matrices, angle in [0, π).
-template <class V> inline void rotation_between(const V* A, const V* B, V* v) {
-  V M[9];
-  product_transposed(A, B, M);
-  const V twice[3] = {M[7] - M[5], M[2] - M[6], M[3] - M[1]};  // 2 sin(angle) · axis
-  const V square = V(0.25) * dot(twice, twice), cosine = V(0.5) * (trace(M) - V(1));
+// log of A Bᵀ, both rotation matrices, angle in [0, π); in a plane (−π, π).
+template <int D = 3, class V> inline void rotation_between(const V* A, const V* B, V* v) {
+  V M[D * D], twice[turns(D)];  // 2 sin(angle) · axis
+  product_transposed<D>(A, B, M);
+  curl<D>(M, twice);
+  const V square = V(0.25) * dot<turns(D)>(twice, twice), cosine = V(0.5) * (trace<D>(M) - V(D - 2));
   const auto small = (square < V(SMALL * SMALL)) & (cosine > V(0));
   const V sine = sqrt(select(small, V(1), max(square, V(1e-12))));
   const V series = V(1) + square * V(1.0 / 6) * (V(1) + square * V(9.0 / 20) * (V(1) + square * V(25.0 / 42)));
   const V angle = V(2) * arctangent(sine / max(V(1) + cosine, V(1e-12)));
   const V scale = V(0.5) * select(small, series, angle / sine);
-  for (int i = 0; i < 3; i++) v[i] = scale * twice[i];
+  for (int i = 0; i < turns(D); i++) v[i] = scale * twice[i];
 }
 
 // The coefficient of [φ]² in the inverse Jacobians of the exponential, of ‖φ‖².
@@ -134,7 +134,11 @@ template <class V> inline V log_curvature(V square) {
 }
 
 // 1 + a [φ]× + c [φ]², c the coefficient above: a = −½ is the inverse left Jacobian, 0 the symmetric part of both.
-template <class V> inline void log_jacobian(const V* phi, V a, V* out) {
+template <int D = 3, class V> inline void log_jacobian(const V* phi, V a, V* out) {
+  if constexpr (D == 2) {
+    out[0] = V(1);
+    return;
+  }
   const V square = dot(phi, phi), c = log_curvature(square);
   for (int i = 0; i < 3; i++)
     for (int j = 0; j < 3; j++) out[3 * i + j] = c * phi[i] * phi[j];

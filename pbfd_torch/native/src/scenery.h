@@ -5,21 +5,21 @@
 namespace pbfd {
 
 // One for all worlds of a call.
-template <class V, class N> struct Scenery {
-  Plan<N> plan;
+template <class V, class N, int D> struct Scenery {
+  Plan<N, D> plan;
   static int room(Sizes) { return 0; }
   Scenery(Sizes s, const int* whole, const N* real, Arena<V>&) : plan(s, whole, real) {}
   void enter(int, int) {}
 };
 
 // Worlds that have numbers of their own, [worlds, count]: a lane takes them up with the world.
-template <class T, int W> struct Scenery<Lanes<T, W>, Lanes<T, W>> {
+template <class T, int W, int D> struct Scenery<Lanes<T, W>, Lanes<T, W>, D> {
   using V = Lanes<T, W>;
   const T* all;
   V* here;
   int count;
-  Plan<V> plan;
-  static int room(Sizes s) { return Plan<V>::real_numbers(s); }
+  Plan<V, D> plan;
+  static int room(Sizes s) { return Plan<V, D>::real_numbers(s); }
   Scenery(Sizes s, const int* whole, const T* real, Arena<V>& arena)
       : all(real), here(arena.take(room(s))), count(room(s)), plan(s, whole, here) {}
   void enter(int lane, int world) {

@@ -22,7 +22,8 @@ template <class V> inline V touching_share(V low_work, V low_curve, V high_work,
 }
 
 // The first length to try: 1 where the work is expected to end short of its zero, or at it, else where it first vanishes.
-template <class V, class N> inline V first_length(const Outlook<V, N>& outlook, V work, V curve, typename Kind<V>::Mask where) {
+template <class V, class N, int D>
+inline V first_length(const Outlook<V, N, D>& outlook, V work, V curve, typename Kind<V>::Mask where) {
   const V zero(0), one(1);
   V high_curve;
   const V end = outlook.work(one, high_curve);

@@ -19,7 +19,7 @@ template <class V> inline typename Kind<V>::Mask near(const V* q, int count) {
 }
 
 // Who can make a step Δt with the velocity v.
-template <class V, class N> inline typename Kind<V>::Mask slow(const Plan<N>& plan, const V* v, V dt) {
+template <class V, class N, int D> inline typename Kind<V>::Mask slow(const Plan<N, D>& plan, const V* v, V dt) {
   typename Kind<V>::Mask all(true);
   for (int i = 0; i < plan.nv; i++)
     all = all & (abs(v[i]) <= V(FASTEST)) & (abs(v[i]) * V(plan.turns[i]) * dt <= V(FULLEST_TURN));

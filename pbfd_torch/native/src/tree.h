@@ -45,14 +45,16 @@ template <class V, class N, int D> inline void place(const Plan<N, D>& plan, con
       for (int i = 0; i < D * D; i++) R[i] = base[i];
     } else if (kind == HINGE) {
       V sine, cosine;
-      sine_cosine(x[0] - V(plan.reference[k]), sine, cosine);
+      const V angle = x[0] - V(plan.reference[k]);
+      sine_cosine(D == 3 ? angle : V(plan.sense[k]) * angle, sine, cosine);
       for (int i = 0; i < D; i++) {
         const V a = base[D * i], b = base[D * i + 1];
         R[D * i] = fma(cosine, a, sine * b), R[D * i + 1] = fma(cosine, b, -(sine * a));
-        R[D * i + 2] = s[i] = base[D * i + 2];
+        if constexpr (D == 3) R[D * i + 2] = s[i] = base[D * i + 2];
       }
+      if constexpr (D == 2) s[0] = V(plan.sense[k]);
       about<D>(p, s, s + T);
-    } else {
+    } else if constexpr (D == 3) {
       V turn[9];
       quaternion_matrix(x + (kind == FREE ? 3 : 0), turn);
       product(base, turn, R);
@@ -70,7 +72,7 @@ template <class V, class N, int D> inline void place(const Plan<N, D>& plan, con
 }
 
 // q moved by the tangent vector `along` times a.
-template <class V, class N> inline void retract(const Plan<N>& plan, const V* q, const V* along, V a, V* out) {
+template <class V, class N, int D> inline void retract(const Plan<N, D>& plan, const V* q, const V* along, V a, V* out) {
   for (int k = 0; k < plan.nodes; k++) {
     const int kind = plan.kind[k];
     const V *x = q + plan.q[k], *d = along + plan.v[k];
@@ -88,7 +90,7 @@ template <class V, class N> inline void retract(const Plan<N>& plan, const V* q,
 }
 
 // The tangent vector that takes `from` to `to`.
-template <class V, class N> inline void difference(const Plan<N>& plan, const V* from, const V* to, V* out) {
+template <class V, class N, int D> inline void difference(const Plan<N, D>& plan, const V* from, const V* to, V* out) {
   for (int k = 0; k < plan.nodes; k++) {
     const int kind = plan.kind[k];
     const V *x = from + plan.q[k], *y = to + plan.q[k];

@@ -39,6 +39,16 @@ template <int D, class V> inline void swing(const V* w, const V* x, V* out) {
   }
 }
 
+// ω × x = [−[x]×] ω, [D × turns(D)].
+template <int D, class V> inline void arms(const V* x, V* out) {
+  if constexpr (D == 3) {
+    out[0] = out[4] = out[8] = V(0);
+    out[1] = x[2], out[2] = -x[1], out[3] = -x[2], out[5] = x[0], out[6] = x[1], out[7] = -x[0];
+  } else {
+    out[0] = -x[1], out[1] = x[0];
+  }
+}
+
 // out = p × f: the torque of a force.
 template <int D, class V> inline void lever(const V* p, const V* f, V* out) {
   if constexpr (D == 3)
@@ -100,6 +110,16 @@ template <int D = 3, class V> inline V trace(const V* M) {
   V sum = M[0];
   for (int i = 1; i < D; i++) sum += M[(D + 1) * i];
   return sum;
+}
+
+template <int D, class V> inline V determinant(const V* M) {
+  if constexpr (D == 3) {
+    V c[3];
+    cross(M + 3, M + 6, c);
+    return dot(M, c);
+  } else {
+    return fma(M[0], M[3], -(M[1] * M[2]));
+  }
 }
 
 // tr(M) 1 − M: how Σ m x xᵀ answers a turning; in a plane a number.
