@@ -21,7 +21,7 @@ NUMBERS = ("gained", "surplus", "peak")
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates")),
+        *((name, ctypes.c_int) for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates", "planes")),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -69,22 +69,15 @@ class Core:
         """One step of all worlds: the state after it, how it was solved, and which worlds `[*batch]` the scheme refuses. The
         numbers that a step remembers besides are the state's own."""
         batch = tuple(state.q.shape[:-1])
-        worlds = state.q[..., 0].numel()
-        like = state.q
-        if control is None:
-            control = like.new_zeros(self.plan.sizes[3])
-        given = [_last(getattr(state, name), batch, worlds) for name in VECTORS]
-        given += [getattr(state, name).expand(batch).reshape(worlds).contiguous() for name in NUMBERS]
-        given.append(_last(control, batch, worlds))
-        found = [torch.empty_like(x) for x in given[:9]] + [like.new_empty(worlds)]
+        step, given = self._step(state, control, terms)
+        worlds = step.worlds
+        found = [torch.empty_like(x) for x in given[:9]] + [state.q.new_empty(worlds)]
         counted = [torch.empty(worlds, dtype=torch.int32) for _ in range(5)]
-        room = torch.empty(self._room + 64, dtype=torch.uint8)
-        step = _Step(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, worlds, 0, worlds)
-        for array, values in ((step.given, given), (step.found, found), (step.counted, counted)):
+        for array, values in ((step.found, found), (step.counted, counted)):
             for i, x in enumerate(values):
                 array[i] = x.data_ptr()
-        aligned = (room.data_ptr() + 63) // 64 * 64
-        self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(step), ctypes.c_void_p(aligned))
+        room = self._aligned_room()
+        self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(step), ctypes.c_void_p(room.data_ptr()))
 
         def shaped(x: Tensor) -> Tensor:
             return x.mT.contiguous().reshape(*batch, -1) if x.ndim == 2 else x.reshape(batch)
@@ -102,6 +95,35 @@ class Core:
             lanes=int(evaluations.sum()),
         )
         return after, solution, refused.to(torch.bool)
+
+    def balance(self, state: Velocities, control: Tensor | None, terms: Terms, q: Tensor) -> tuple[Tensor, Tensor]:
+        """The balance of forces that the step from a state solves at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
+        batch, nv = tuple(state.q.shape[:-1]), self.plan.sizes[2]
+        step, _kept = self._step(state, control, terms)
+        at = _last(q, batch, step.worlds)
+        residual, jacobian = q.new_empty(nv, step.worlds), q.new_empty(nv * nv, step.worlds)
+        room = self._aligned_room()
+        addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian, room)]
+        self._functions.pbfd_balance(ctypes.byref(self._plan), ctypes.byref(step), *addresses)
+        return residual.mT.reshape(*batch, nv), jacobian.mT.reshape(*batch, nv, nv)
+
+    def _step(self, state: Velocities, control: Tensor | None, terms: Terms) -> tuple[_Step, list[Tensor]]:
+        """What is given to a step of all worlds, and the arrays that it points to."""
+        batch, worlds = tuple(state.q.shape[:-1]), state.q[..., 0].numel()
+        if control is None:
+            control = state.q.new_zeros(self.plan.sizes[3])
+        given = [_last(getattr(state, name), batch, worlds) for name in VECTORS]
+        given += [getattr(state, name).expand(batch).reshape(worlds).contiguous() for name in NUMBERS]
+        given.append(_last(control, batch, worlds))
+        step = _Step(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, worlds, 0, worlds)
+        for i, x in enumerate(given):
+            step.given[i] = x.data_ptr()
+        return step, given
+
+    def _aligned_room(self) -> Tensor:
+        """Memory to work in, which begins where a register may lie."""
+        room = torch.empty(self._room + 64, dtype=torch.uint8)
+        return room[-room.data_ptr() % 64 :]
 
 
 def _last(values: Tensor, batch: Sequence[int], worlds: int) -> Tensor:

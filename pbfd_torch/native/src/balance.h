@@ -21,25 +21,24 @@ template <class V, class N> struct Balance {
   bool on_chord;
   // at the configuration
   Poses<V> now, chord;
-  V *axes, *chord_axes, *residual, *matrix, *turns;
+  V *axes, *chord_axes, *residual, *matrix;
   Pull<V>* pulls;
   Push<V>* pushes;
-  bool* turned;
+  Contacts<V, N> contacts;
 
   static int room(Sizes s) {  // in V, for the arena
-    const int loads = int((sizeof(Pull<V>) + sizeof(Push<V>)) / sizeof(V)) + 3;
-    return s.nodes * (48 + 3 + loads) + 2 * s.nq + s.nu + 13 * s.nv + s.nv * s.nv;
+    const int loads = int((sizeof(Pull<V>) + sizeof(Push<V>)) / sizeof(V)) + 2;
+    return s.nodes * (48 + loads) + 2 * s.nq + s.nu + 13 * s.nv + s.nv * s.nv + Contacts<V, N>::room(s);
   }
 
-  Balance(const Plan<N>& scene, Arena<V>& arena) : plan(scene) {
+  Balance(const Plan<N>& scene, Arena<V>& arena) : plan(scene), contacts(scene, arena) {
     start = Poses<V>::in(arena, plan), target = Poses<V>::in(arena, plan);
     now = Poses<V>::in(arena, plan), chord = Poses<V>::in(arena, plan);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
     axes = arena.take(6 * plan.nv), chord_axes = arena.take(6 * plan.nv);
-    residual = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv), turns = arena.take(3 * plan.nodes);
+    residual = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     pulls = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
     pushes = reinterpret_cast<Push<V>*>(arena.take(plan.nodes * int((sizeof(Push<V>) + sizeof(V) - 1) / sizeof(V))));
-    turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
   }
 
   // All of it at q; the matrix by `assemble`.
@@ -60,7 +59,7 @@ template <class V, class N> struct Balance {
       else
         pulls[k].clear();  // a joint that only leads to others
     }
-    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns, turned);
+    contacts.look(now), contacts.press(pushes);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) {
         pulls[plan.parent[k]].add(pulls[k]);

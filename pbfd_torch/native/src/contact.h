@@ -1,105 +1,102 @@
-// Balls and points of the bodies against half-spaces: N n − G u at p = c − ρ n (METHOD §4), as terms/touching.py.
+// Contact of candidates with solids at rest: what is known of a step beforehand, the loads at a configuration, and hazards
+// (terms/contact.py, contact/hazards.py).
 #pragma once
-#include "friction.h"
-#include "loads.h"
-#include "release.h"
+#include "kinds.h"
+#include "touching.h"
 
 namespace pbfd {
 
-// What is fixed in a step: where the candidates and their nodes were at its start.
-template <class V> struct ContactStep {
-  Poses<V> start;
+template <class V, class N> struct Contacts {
+  using M = typename Kind<V>::Mask;
+  const Plan<N>& plan;
+  const Candidates<N>& candidates;
+  // what is fixed in a step
+  Poses<V> before;  // of the nodes at its start
   V dt;
-};
+  // of the nodes at a configuration: the rotation since the start and how it answers a turn, where asked for
+  Poses<V> now;
+  V *turns, *rollings;  // [3], [9]
+  bool* turned;
 
-template <class V, class N> inline V height(const Plan<N>& plan, int i, Poses<V> at, V* center) {
-  const int k = plan.carrier[i];
-  times(at.rotation + 9 * k, plan.position + 3 * i, center);
-  for (int j = 0; j < 3; j++) center[j] += at.position[3 * k + j];
-  const N* n = plan.normal + 3 * i;
-  return fma(V(n[0]), center[0], fma(V(n[1]), center[1], V(n[2]) * center[2])) - V(plan.offset[i]);
-}
-
-// Adds the forces on all nodes, and how they answer; `turns` [3] and `turned` per node: room for their rotations over the step.
-template <class V, class N>
-inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> now, Push<V>* pushes, V* turns, bool* turned) {
-  const V zero(0), range = V(plan.release[0]) * step.dt, width = V(plan.slip_speed[0]) * step.dt;
-  for (int k = 0; k < plan.nodes; k++) turned[k] = false;
-  for (int i = 0; i < plan.candidates; i++) {
-    V c[3], before[3];
-    const V reach = V(plan.radius[i]) + V(plan.margin[i]), depth = reach - height(plan, i, now, c);
-    if (!any(depth > zero)) continue;
-    const int k = plan.carrier[i];
-    const V radius = V(plan.radius[i]), start = reach - height(plan, i, step.start, before);
-    const V n[3] = {V(plan.normal[3 * i]), V(plan.normal[3 * i + 1]), V(plan.normal[3 * i + 2])};
-    V roll[9], moved[3];
-    const bool round = any(radius > zero);
-    for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
-    if (round) {
-      V* phi = turns + 3 * k;
-      if (!turned[k]) rotation_between(now.rotation + 9 * k, step.start.rotation + 9 * k, phi), turned[k] = true;
-      V beside[3];
-      cross(phi, n, beside);
-      for (int j = 0; j < 3; j++) moved[j] = fma(-radius, beside[j], moved[j]);
-      log_jacobian(phi, V(-0.5), roll);
-    }
-    const V lifted = dot(moved, n);
-    V u[3], p[3];
-    for (int j = 0; j < 3; j++) u[j] = fma(-lifted, n[j], moved[j]), p[j] = fma(-radius, n[j], c[j]);
-    V N_, rises, factor, falls;
-    releasing(V(plan.firmness[i]), depth, start, range, N_, rises);
-    const V size = sqrt(dot(u, u)), mu = V(plan.grip[i]);
-    slip_factor(size, width, factor, falls);
-    const V drag = mu * N_ * factor, by_depth = mu * rises * factor, by_size = mu * N_ * falls;
-    V f[3];
-    for (int j = 0; j < 3; j++) f[j] = fma(N_, n[j], -(drag * u[j]));
-
-    // how the centre, the depth and the slip answer (ω, v): [−[c]× | 1], n · that, and (1 − nnᵀ) of it and of the rolling
-    V sinks[6], slips[18];
-    cross(c, n, sinks);
-    for (int j = 0; j < 3; j++) sinks[3 + j] = n[j];
-    V move[18];
-    const V arm[9] = {zero, c[2], -c[1], -c[2], zero, c[0], c[1], -c[0], zero};
-    for (int a = 0; a < 3; a++)
-      for (int b = 0; b < 3; b++) {
-        move[6 * a + b] = arm[3 * a + b];
-        move[6 * a + 3 + b] = a == b ? V(1) : zero;
-      }
-    if (round)
-      for (int b = 0; b < 3; b++) {
-        const V column[3] = {roll[b], roll[3 + b], roll[6 + b]};
-        V beside[3];
-        cross(n, column, beside);
-        for (int a = 0; a < 3; a++) move[6 * a + b] = fma(radius, beside[a], move[6 * a + b]);
-      }
-    V answer[18], grows[6];
-    for (int b = 0; b < 6; b++) {
-      const V along = fma(n[0], move[b], fma(n[1], move[6 + b], n[2] * move[12 + b]));
-      for (int a = 0; a < 3; a++) slips[6 * a + b] = fma(-along, n[a], move[6 * a + b]);
-      grows[b] = fma(u[0], slips[b], fma(u[1], slips[6 + b], u[2] * slips[12 + b]));
-      const V resists = fma(by_size, grows[b], -(by_depth * sinks[b])), presses = rises * sinks[b];
-      for (int a = 0; a < 3; a++) answer[6 * a + b] = fma(n[a], presses, fma(drag, slips[6 * a + b], u[a] * resists));
-    }
-    Push<V>& out = pushes[k];
-    out.open();
-    for (int a = 0; a < 3; a++) {
-      out.force[a] -= f[a];
-      for (int b = 0; b < 3; b++) out.moment[3 * a + b] = fma(-f[a], p[b], out.moment[3 * a + b]);
-    }
-    for (int b = 0; b < 6; b++) {
-      const V column[3] = {answer[b], answer[6 + b], answer[12 + b]};
-      V torque[3];
-      cross(p, column, torque);
-      for (int a = 0; a < 3; a++) out.stiffness[6 * a + b] += torque[a], out.stiffness[6 * (3 + a) + b] += column[a];
-    }
-    if (round) {  // the force does not act on one material point
-      const V pulled = radius * dot(n, f);
-      for (int a = 0; a < 3; a++) {
-        out.stiffness[7 * a] += pulled;
-        for (int b = 0; b < 3; b++) out.stiffness[6 * a + b] = fma(-radius * n[a], f[b], out.stiffness[6 * a + b]);
-      }
-    }
+  static int room(Sizes s) {
+    return 12 * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-}
+  Contacts(const Plan<N>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
+    turns = arena.take(3 * plan.nodes), rollings = arena.take(9 * plan.nodes);
+    turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
+  }
+
+  // The step begins at these poses.
+  void begin(Poses<V> start, V step) { before = start, dt = step; }
+
+  // The nodes are at these poses.
+  void look(Poses<V> poses) {
+    now = poses;
+    for (int k = 0; k < plan.nodes; k++) turned[k] = false;
+  }
+
+  // Adds the loads of what touches.
+  void press(Push<V>* pushes) {
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      using Surface = typename decltype(pair)::Surface;
+      using Support = typename decltype(pair)::Support;
+      for (int i = first; i < last; i++) {
+        Touching<V> t;
+        center(i, now, t.center);
+        t.depth = depth(pair, i, now, t.center, t.solid);
+        if (!any(t.depth > V(0))) continue;
+        touch(pair, i, t);
+        pbfd::press<Surface, Support>(t, pushes[candidates.carrier[i]]);
+      }
+    });
+  }
+
+  // What is too deep, and who touches something and has turned by more than a quarter turn.
+  void look_for_hazards(M& deep, M& far) const {
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) {
+        const V *R = now.rotation + 9 * candidates.carrier[i], *R0 = before.rotation + 9 * candidates.carrier[i];
+        V c[3], traced(0);
+        Beside<V> solid;
+        center(i, now, c);
+        const V d = depth(pair, i, now, c, solid);
+        for (int j = 0; j < 9; j++) traced = fma(R[j], R0[j], traced);
+        deep = deep | (d > V(candidates.deep[i])), far = far | ((d > V(0)) & (traced < V(1)));
+      }
+    });
+  }
+
+  void center(int i, Poses<V> at, V* out) const {
+    const int k = candidates.carrier[i];
+    times(at.rotation + 9 * k, candidates.position + 3 * i, out);
+    for (int j = 0; j < 3; j++) out[j] += at.position[3 * k + j];
+  }
+
+  template <class Pair> V depth(Pair, int i, Poses<V> at, const V* c, Beside<V>& solid) const {
+    Pair::Surface::beside(candidates, i, c, solid);
+    const V reach = Pair::Support::reach(candidates, i, at.rotation + 9 * candidates.carrier[i], solid.normal);
+    return reach + V(candidates.margin[i]) - solid.distance;
+  }
+
+  // The rest of what is to be known of a candidate whose centre and depth are.
+  template <class Pair> void touch(Pair, int i, Touching<V>& t) {
+    const int k = candidates.carrier[i];
+    V c[3];
+    Beside<V> solid;
+    center(i, before, c);
+    t.start = depth(Pair(), i, before, c, solid);
+    for (int j = 0; j < 3; j++) t.moved[j] = t.center[j] - c[j];
+    Pair::Surface::bend(candidates, i, t.center, t.solid, t.bend);
+    Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + 9 * k, t.solid.normal, t.bend, t.arm);
+    t.firmness = V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
+    t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
+    if (!Pair::Support::rolls) return;
+    t.turn = turns + 3 * k, t.rolling = rollings + 9 * k;
+    if (turned[k]) return;
+    rotation_between(now.rotation + 9 * k, before.rotation + 9 * k, turns + 3 * k);
+    log_jacobian(turns + 3 * k, V(-0.5), rollings + 9 * k);
+    turned[k] = true;
+  }
+};
 
 }  // namespace pbfd

@@ -14,7 +14,7 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it. Scalars are of 8 or 4 bytes, `numbers` and all arrays below alike.
 struct pbfd_plan {
-  int bytes, nodes, nq, nv, nu, candidates;
+  int bytes, nodes, nq, nv, nu, candidates, planes;
   const int* whole;
   const void* real;
 };
@@ -38,3 +38,7 @@ PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 
 // The energy–momentum step by Newton's method from the guess or from θ_n: what it leaves unsolved, and what it refuses, it says.
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_step*, void* room);
+
+// The balance of forces that a step from the given states solves, at configurations [nq, worlds]: r [nv, worlds] and
+// J [nv · nv, worlds].
+PBFD_FUNCTION void pbfd_balance(const pbfd_plan*, const pbfd_step*, const void* q, void* residual, void* jacobian, void* room);

@@ -1,12 +1,13 @@
 // The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
 #include "interface.h"
 
+#include "inspection.h"
 #include "machine.h"
 #include "target.h"
 
 using namespace pbfd;
 
-int pbfd_interface() { return 2; }
+int pbfd_interface() { return 3; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -14,7 +15,9 @@ const char* pbfd_target() { return target; }
 
 namespace {
 
-Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
+Sizes sizes(const pbfd_plan* p) {
+  return {{p->candidates, p->planes}, p->nodes, p->nq, p->nv, p->nu};
+}
 
 template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
   using T = typename Kind<V>::Scalar;
@@ -29,6 +32,17 @@ template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, 
       s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
   machine.scheme.surplus_allowed = V(T(s->surplus));
   machine.run(arrays, s->worlds, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
+}
+
+template <class T>
+void balance_of(const pbfd_plan* p, const pbfd_step* s, const void* q, void* residual, void* jacobian, void* room) {
+  using V = Lanes<T, register_bytes / int(sizeof(T))>;
+  const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
+  Arena<V> arena{static_cast<V*>(room)};
+  auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
+  const BalanceArrays<T> arrays{
+      given(0), given(1), given(9), static_cast<const T*>(q), static_cast<T*>(residual), static_cast<T*>(jacobian)};
+  inspect(plan, arrays, s->worlds, s->first, s->last, V(T(s->dt)), arena);
 }
 
 // A single world is spared the work of lanes that nobody needs.
@@ -54,4 +68,8 @@ long pbfd_room(const pbfd_plan* p) {
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_step* s, void* room) {
   p->bytes == 8 ? energy_momentum_of<double>(p, s, room) : energy_momentum_of<float>(p, s, room);
+}
+
+void pbfd_balance(const pbfd_plan* p, const pbfd_step* s, const void* q, void* residual, void* jacobian, void* room) {
+  (p->bytes == 8 ? balance_of<double> : balance_of<float>)(p, s, q, residual, jacobian, room);
 }

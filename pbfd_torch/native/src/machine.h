@@ -82,17 +82,10 @@ template <class V, class N> struct Machine {
     return busy == 0 || (more && 2 * ended >= W);
   }
 
-  // What is too deep, and who touches something and has turned by more than a quarter turn (contact/hazards.py).
+  // Of contacts and limits (contact/hazards.py).
   void look_for_hazards(M& deep, M& far) const {
-    const Balance<V, N>& b = newton.balance;
     deep = far = M(false);
-    for (int i = 0; i < plan.candidates; i++) {
-      const int k = plan.carrier[i];
-      V c[3], turned(0);
-      const V depth = V(plan.radius[i]) + V(plan.margin[i]) - height(plan, i, b.now, c);
-      for (int j = 0; j < 9; j++) turned = fma(b.now.rotation[9 * k + j], b.start.rotation[9 * k + j], turned);
-      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(1)));
-    }
+    newton.balance.contacts.look_for_hazards(deep, far);
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k];

@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, sinks, faster, stiffness, mu, size, along, square, cube, fourth;
+  V depth, start, steepness, sinks, faster, stiffness, mu, range, width, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -19,9 +19,9 @@ template <class V, class N> struct Outlook {
   Coming<V>* coming;
   Stop<V>* stops;
   V *twist, *drift;  // [6] per node
-  int contacts = 0, limits = 0;
+  int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
-  V range, width, limit_range;
+  V limit_range;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -32,55 +32,17 @@ template <class V, class N> struct Outlook {
     twist = arena.take(6 * s.nodes), drift = arena.take(6 * s.nodes);
   }
 
-  // Along d from q, where the work is `work` and its slope dᵀJd is `curve`. `where`: for which lanes it counts.
-  void look(const Balance<V, N>& b, const V* q, const V* d, V work, V curve, typename Kind<V>::Mask where) {
+  // Along d from q, where the work is `start` and its slope dᵀJd is `curve`. `where`: for which lanes it counts.
+  void look(Balance<V, N>& b, const V* q, const V* d, V start, V curve, typename Kind<V>::Mask where) {
     const Plan<N>& plan = b.plan;
     const V zero(0);
-    base = work, slope = curve, contacts = limits = 0;
-    range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt, limit_range = V(plan.limit_release[0]) * b.dt;
+    count = limits = 0, base = slope = zero;
+    limit_range = V(plan.limit_release[0]) * b.dt;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
-    for (int i = 0; i < plan.candidates; i++) {
-      const int k = plan.carrier[i];
-      V c[3], before[3], n[3];
-      const V radius = V(plan.radius[i]), reach = radius + V(plan.margin[i]);
-      const V depth = reach - height(plan, i, b.now, c);
-      for (int j = 0; j < 3; j++) n[j] = V(plan.normal[3 * i + j]);
-      const V *t = twist + 6 * k, *e = drift + 6 * k;
-      V v[3], a[3];
-      cross(t, c, v);
-      for (int j = 0; j < 3; j++) v[j] += t[3 + j];
-      cross(e, c, a);
-      for (int j = 0; j < 3; j++) a[j] += e[3 + j];
-      add_cross(t, v, a);
-      const V sinks = -dot(v, n), faster = -dot(a, n);
-      if (!any((depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) continue;
-      Coming<V>& out = coming[contacts++];
-      out.depth = depth, out.start = reach - height(plan, i, b.start, before), out.sinks = sinks, out.faster = faster;
-      out.stiffness = V(plan.firmness[i]), out.mu = V(plan.grip[i]);
-      V moved[3], first[3], second[3];
-      for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
-      if (any(radius > zero)) {  // the surface moves by φ × s beside its centre, s = −ρ n
-        V phi[3], beside[3];
-        rotation_between(b.now.rotation + 9 * k, b.start.rotation + 9 * k, phi);
-        cross(phi, n, beside);
-        for (int j = 0; j < 3; j++) moved[j] = fma(-radius, beside[j], moved[j]);
-        cross(t, n, beside);
-        for (int j = 0; j < 3; j++) v[j] = fma(-radius, beside[j], v[j]);
-        cross(e, n, beside);
-        for (int j = 0; j < 3; j++) a[j] = fma(-radius, beside[j], a[j]);
-      }
-      const V lifted = dot(moved, n);
-      for (int j = 0; j < 3; j++) {
-        moved[j] = fma(-lifted, n[j], moved[j]);
-        first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
-      }
-      out.size = dot(moved, moved), out.along = dot(moved, first);
-      out.square = dot(first, first) + dot(moved, second), out.cube = dot(first, second), out.fourth = dot(second, second);
-      V df;
-      base -= of_contact(out, zero, df);
-      slope -= df;
-    }
+    each_kind(plan.contact, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) foresee(b.contacts, pair, i, where);
+    });
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k], c = plan.q[k];
@@ -90,23 +52,56 @@ template <class V, class N> struct Outlook {
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
         out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
-        V df;
-        base -= of_limit(out, zero, df);
-        slope -= df;
       }
     }
+    V known;
+    base = start - work(zero, known), slope = curve - known;
   }
 
   // φ and dφ/da at a length.
   V work(V a, V& df) const {
     V f = fma(a, slope, base), d;
     df = slope;
-    for (int i = 0; i < contacts; i++) f += of_contact(coming[i], a, d), df += d;
+    for (int i = 0; i < count; i++) f += of_contact(coming[i], a, d), df += d;
     for (int i = 0; i < limits; i++) f += of_limit(stops[i], a, d), df += d;
     return f;
   }
 
  private:
+  // A candidate whose surface moves on a parabola, c + s with s held on the body; the normal is held but for the depth.
+  template <class Pair> void foresee(Contacts<V, N>& contacts, Pair pair, int i, typename Kind<V>::Mask where) {
+    using Surface = typename Pair::Surface;
+    using Support = typename Pair::Support;
+    const int k = contacts.candidates.carrier[i];
+    const V zero(0), *t = twist + 6 * k, *e = drift + 6 * k;
+    Touching<V> at;
+    const V *c = at.center, *n = at.solid.normal;
+    contacts.center(i, contacts.now, at.center);
+    at.depth = contacts.depth(pair, i, contacts.now, c, at.solid);
+    V v[3], a[3];
+    cross(t, c, v);
+    for (int j = 0; j < 3; j++) v[j] += t[3 + j];
+    cross(e, c, a);
+    for (int j = 0; j < 3; j++) a[j] += e[3 + j];
+    add_cross(t, v, a);
+    V sinks = -dot(v, n), faster = -dot(a, n);
+    if (!any((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) return;
+    contacts.touch(pair, i, at);
+    Coming<V>& out = coming[count++];
+    if constexpr (Support::rolls) add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
+    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = faster, out.steepness = at.solid.steepness;
+    out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
+    V u[3], first[3], second[3];
+    at.template travel<Surface, Support>(u);
+    const V lifted = dot(u, n);
+    for (int j = 0; j < 3; j++) {
+      u[j] = fma(-lifted, n[j], u[j]);
+      first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
+    }
+    out.size = dot(u, u), out.along = dot(u, first);
+    out.square = dot(first, first) + dot(u, second), out.cube = dot(first, second), out.fourth = dot(second, second);
+  }
+
   // V̇ = Σ ṡ_i d_i, ṡ_i = ad(V_carrier) s_i, of all nodes.
   void drifts(const Plan<N>& plan, const V* axes, const V* d) {
     for (int k = 0; k < plan.nodes; k++) {
@@ -134,15 +129,15 @@ template <class V, class N> struct Outlook {
   }
 
   V of_contact(const Coming<V>& c, V a, V& df) const {
-    const V deep = c.depth + a * fma(V(0.5) * a, c.faster, c.sinks), speed = fma(a, c.faster, c.sinks);
+    const V deep = fma(c.steepness * a, fma(V(0.5) * a, c.faster, c.sinks), c.depth), speed = fma(a, c.faster, c.sinks);
     V push, rises, factor, falls;
-    releasing(c.stiffness, deep, c.start, range, push, rises);
+    releasing(c.stiffness, deep, c.start, c.range, push, rises);
     const V square = c.size + a * (V(2) * c.along + a * (c.square + a * (c.cube + V(0.25) * a * c.fourth)));
-    slip_factor(sqrt(max(square, V(0))), width, factor, falls);
+    slip_factor(sqrt(max(square, V(0))), c.width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    const V drags = (rises * speed * factor + push * falls * on) * on + push * factor * further;
-    df = rises * speed * speed + push * c.faster + c.mu * drags;
+    const V grows = rises * c.steepness * speed, drags = (grows * factor + push * falls * on) * on + push * factor * further;
+    df = grows * speed + push * c.faster + c.mu * drags;
     return push * speed + c.mu * push * factor * on;
   }
 
