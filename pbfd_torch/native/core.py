@@ -5,7 +5,9 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
@@ -27,7 +29,7 @@ BLOCKS = 4  # for each thread: some worlds take longer than others
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "dimension", "each", "nodes", "nq", "nv", "nu", "candidates")),
+        *((name, ctypes.c_int) for name in ("bytes", "dimension", "each", "nodes", "nq", "nv", "nu", "candidates", "planes")),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -114,7 +116,7 @@ class Core:
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), plan.real.shape[-1]):
             raise ValueError(f"the plan has {len(plan.whole)} and {plan.real.shape[-1]} numbers: the core wants {wanted}")
-        self._room = self._asked("pbfd_room") + ALIGNMENT
+        self._size = self._asked("pbfd_room") + ALIGNMENT
         self._rooms: list[Tensor] = []  # that no call is in
         self._lanes = library.lanes(plan.real.dtype)
 
@@ -137,13 +139,29 @@ class Core:
         list(_pool(self._threads).map(self._make, calls))
 
     def _make(self, asked: _Steps) -> None:
+        with self._room() as room:
+            self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(asked), room)
+
+    @contextmanager
+    def _room(self) -> Iterator[ctypes.c_void_p]:
+        """Memory to work in, which begins where a register may lie; one call at a time is in it."""
         try:
             room = self._rooms.pop()
         except IndexError:
-            room = torch.empty(self._room, dtype=torch.uint8)
-        aligned = -(-room.data_ptr() // ALIGNMENT) * ALIGNMENT
-        self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(asked), ctypes.c_void_p(aligned))
+            room = torch.empty(self._size, dtype=torch.uint8)
+        yield ctypes.c_void_p(-(-room.data_ptr() // ALIGNMENT) * ALIGNMENT)
         self._rooms.append(room)
+
+    def balance(self, state: Velocities, control: Tensor | None, terms: Terms, q: Tensor) -> tuple[Tensor, Tensor]:
+        """The balance of forces of the step from a state at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
+        batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
+        held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
+        journey = Journey(state, held, 1)
+        at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
+        addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
+        with self._room() as room:
+            self._functions.pbfd_balance(ctypes.byref(self._plan), ctypes.byref(journey.call(terms)), *addresses, room)
+        return residual, jacobian
 
 
 def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:

@@ -3,46 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.surface import Plane
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.native.aligned import aligned
+from pbfd_torch.native.not_compiled import unknown
+from pbfd_torch.native.plan_contact import Candidates
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
-from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
 TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Contact)
 
 
-class NotCompiledError(Exception):
-    """What the core does not know, in words."""
-
-
-def _unknown(what: str) -> NotCompiledError:
-    return NotCompiledError(f"the core does not know {what}")
-
-
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, candidates. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or `[worlds, n]` where worlds
-    have numbers of their own. dimension: 2 where all moves in a plane."""
+    """sizes: nodes, nq, nv, nu, and those of the candidates. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or
+    `[worlds, n]` where worlds have numbers of their own. dimension: 2 where all moves in a plane."""
 
-    sizes: tuple[int, int, int, int, int]
+    sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
     dimension: int
@@ -57,10 +48,10 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in zip(t.joint_sizes, t.joint_is_hinge, strict=True)]
     whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
     act, candidates = known.actuators, known.candidates
-    nodes, touching, gravity = _nodes(a), candidates.numbers(a), stepper.scene.gravity
-    plane = plane_of(a, [gravity[None], *touching[5:6]])  # and the normals
+    nodes, gravity = _nodes(a), stepper.scene.gravity
+    plane = plane_of(a, [gravity, *candidates.normals])
     if plane is not None:
-        nodes, touching, gravity = plane.nodes(a, nodes), plane.candidates(candidates.nodes, touching), gravity @ plane.basis
+        nodes, candidates, gravity = plane.nodes(a, nodes), candidates.within(plane), gravity @ plane.basis
     whole += _plain(nodes[0]) + _above(a)
     nu = 0
     driven: list[Tensor] = []
@@ -69,19 +60,19 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         whole += act.coordinate.tolist() + act.dof.tolist()
         ranges = [*act.control_range.unbind(-1), *act.force_range.unbind(-1)]
         driven = [act.gear, act.gain, act.bias, act.stiffness, act.damping, *ranges]
-    whole += candidates.nodes
+    whole += candidates.whole()
     scale = force_scale(a, 1.0).expand(t.nv)
-    speeds = [known.release, known.slip_speed, known.limit_release, known.dry_speed]
+    speeds = [known.limit_release, known.dry_speed]
     real = [
         *nodes,
         *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), known.share, known.spring, known.damping, known.armature),
         *(known.dry, a.lower, a.upper, known.limit, known.rest),
         *driven,
-        *touching,
         *(gravity, reach(a), a.rest.new_tensor(speeds)),
+        *candidates.real(),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    sizes = (t.njoint, t.nq, t.nv, nu, len(candidates.nodes))
+    sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes)
     return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2)
 
 
@@ -89,20 +80,20 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     """Raises `NotCompiledError` for what is not the terms' affair."""
     a, scene = stepper.articulation, stepper.scene
     if a.device.type != "cpu":
-        raise _unknown(f"device {a.device.type}")
+        raise unknown(f"device {a.device.type}")
     if type(stepper.integrator) is not EnergyMomentum:
-        raise _unknown(f"integrator {type(stepper.integrator).__name__}")
+        raise unknown(f"integrator {type(stepper.integrator).__name__}")
     if stepper.step_size.ndim:
-        raise _unknown("a step of its own for each world")
+        raise unknown("a step of its own for each world")
     for what in ("joint_frame", "joint_axis", "joint_ref", "link_frame", "pseudo_inertia", "lower", "upper"):
         if getattr(a, what).ndim != {"joint_ref": 1, "lower": 1, "upper": 1, "joint_axis": 2}.get(what, 3):
-            raise _unknown(f"{what} of its own for each world")
+            raise unknown(f"{what} of its own for each world")
     if scene.gravity.ndim != 1:
-        raise _unknown("gravity of its own for each world")
+        raise unknown("gravity of its own for each world")
     free = [j for j, size in enumerate(a.topology.joint_sizes) if size == (7, 6)]
     eye = torch.eye(4, dtype=a.dtype)
     if any(not torch.equal(a.joint_frame[j], eye) for j in free):
-        raise _unknown("a free joint that does not move along the world's axes")
+        raise unknown("a free joint that does not move along the world's axes")
 
 
 def _plain(frames: Tensor) -> list[int]:
@@ -141,20 +132,6 @@ def _nodes(a: Articulation) -> Sequence[Tensor]:
     return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_ref, sense, mass, center, second, carried
 
 
-@dataclass
-class _Candidates:
-    """Of all contacts with half-spaces."""
-
-    nodes: list[int] = field(default_factory=list)
-    rows: list[tuple[Tensor, ...]] = field(default_factory=list)  # of each contact, what `numbers` gives of all
-
-    def numbers(self, a: Articulation) -> Sequence[Tensor]:
-        """Positions, radii, margins, C⊥, μ, normals, offsets, and from which depth on they are a hazard."""
-        if not self.rows:
-            return ()
-        return [torch.cat([x.to(a.dtype) for x in column]) for column in zip(*self.rows, strict=True)]
-
-
 class _Terms:
     """The numbers of a stepper's terms, of those that are there; the others do nothing."""
 
@@ -163,10 +140,9 @@ class _Terms:
         self.share = zero + 0.5
         self.spring = self.damping = self.armature = self.dry = self.limit = zero
         self.rest = a.rest
-        self.release, self.slip_speed, self.limit_release, self.dry_speed = 0.1, 1e-3, 1.0, 1e-3
+        self.limit_release, self.dry_speed = 1.0, 1e-3
         self.actuators: Actuators | None = None
-        self.candidates = _Candidates()
-        self._speeds: set[tuple[float, float]] = set()
+        self.candidates = Candidates()
         seen: set[type] = set()
         for term in stepper.terms:
             inner: Any = term
@@ -174,13 +150,13 @@ class _Terms:
                 self.share, inner = term.share, term.term
             kind = type(inner)
             if kind not in TERMS:
-                raise _unknown(kind.__name__)
+                raise unknown(kind.__name__)
             if kind in seen and kind is not Contact:
-                raise _unknown(f"two terms {kind.__name__}")
+                raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
             self._take(a, inner)
         if any(x.ndim != 1 for x in (self.share, self.spring, self.damping, self.armature, self.dry, self.limit, self.rest)):
-            raise _unknown("parameters of joints of their own for each world")
+            raise unknown("parameters of joints of their own for each world")
 
     def _take(self, a: Articulation, term: Any) -> None:
         match term:
@@ -194,50 +170,11 @@ class _Terms:
                 self.dry, self.dry_speed = term.torque, term.slip_speed
             case JointLimits():
                 if term.drives is not None:
-                    raise _unknown("limits that actuators without a largest force press on")
+                    raise unknown("limits that actuators without a largest force press on")
                 self.limit, self.limit_release = term.share * term.stiffness, term.release
             case Actuators():
                 if term.gear.ndim != 1:
-                    raise _unknown("actuators of their own for each world")
+                    raise unknown("actuators of their own for each world")
                 self.actuators = term
             case Contact():
-                self._touch(a, term)
-
-    def _touch(self, a: Articulation, term: Contact) -> None:
-        law, friction, name = term.normal_force, term.friction, term.pairs[0][1] if term.pairs else "the ground"
-        if type(term.surface) is not Plane or term.carrier is not None:
-            raise _unknown(f"contact with '{name}', which is no half-space at rest")
-        if type(law) is not NormalForce or law.exponent != 2.0:
-            raise _unknown(f"normal force on '{name}' with another exponent than 2")
-        if type(friction) is not CoulombFriction and friction is not None:
-            raise _unknown(type(friction).__name__)
-        if term.restitution is not None:
-            raise _unknown("restitution")
-        count = len(term.link)
-        slip = self.slip_speed if friction is None else friction.slip_speed
-        self._speeds.add((law.release, slip))
-        if len(self._speeds) > 1:
-            raise _unknown("contacts with different release or slip speeds")
-        self.release, self.slip_speed = law.release, slip
-
-        def each(value: float | Tensor | None, other: float) -> Tensor:
-            number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
-            if number.ndim > 1:
-                raise _unknown(f"contact with '{name}' of its own for each world")
-            return number.expand(count)
-
-        nodes = [a.topology.link_node[link] for link in term.link.tolist()]
-        moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0])
-        if len(moving) == 0:
-            return
-        if term.position.ndim != 2 or term.radius.ndim != 1 or term.margin.ndim != 1:
-            raise _unknown(f"contact with '{name}' of its own for each world")
-        frame = a.link_frame[term.link]
-        position = (frame[:, :3, :3] @ term.position[..., None]).squeeze(-1) + frame[:, :3, 3]
-        mu = each(None if friction is None else friction.mu, 0.0) * each(term.grip, 1.0)
-        stiffness = each(law.stiffness, 0.0) * each(term.firm, 1.0)
-        normal, offset = term.surface.normal.expand(count, 3), term.surface.offset.expand(count)
-        deep = each(term.deep, torch.finfo(a.dtype).max)
-        rows = (position, term.radius, term.margin, stiffness, mu, normal, offset, deep)
-        self.candidates.nodes += [nodes[i] - 1 for i in moving.tolist()]
-        self.candidates.rows.append(tuple(x[moving] for x in rows))
+                self.candidates.take(a, term)

@@ -31,12 +31,9 @@ class Plane:
         second = self.bases.mT @ second @ self.bases
         return frame, _inside(bases, origin), reference, self.sense, mass, _inside(self.bases, center), second, carried
 
-    def candidates(self, nodes: Sequence[int], numbers: Sequence[Tensor]) -> Sequence[Tensor]:
-        """Positions on nodes, …, normals, offsets and depths, in the plane."""
-        if not numbers:
-            return ()
-        position, *others, normal, offset, deep = numbers
-        return _inside(self.bases[list(nodes)], position), *others, normal @ self.basis, offset, deep
+    def on_nodes(self, nodes: Sequence[int], positions: Tensor) -> Tensor:
+        """Positions on nodes, in the plane."""
+        return _inside(self.bases[list(nodes)], positions)
 
 
 def _inside(bases: Tensor, x: Tensor) -> Tensor:
@@ -44,7 +41,7 @@ def _inside(bases: Tensor, x: Tensor) -> Tensor:
 
 
 def plane_of(a: Articulation, vectors: Sequence[Tensor]) -> Plane | None:
-    """The plane in which all nodes move, if there is one in which these vectors `[*, 3]` lie too. a: as `aligned` gives it."""
+    """The plane in which all nodes move, if there is one in which these vectors `[3]` lie too. a: as `aligned` gives it."""
     t = a.topology
     hinges = torch.tensor(t.joint_is_hinge)
     if not bool(hinges.any()) or any(size != (1, 1) for size in t.joint_sizes):
@@ -58,7 +55,7 @@ def plane_of(a: Articulation, vectors: Sequence[Tensor]) -> Plane | None:
     axes = turned[:, :, 2]
     along = (axes @ normal).squeeze(-1)
     tiny = 16.0 * torch.finfo(a.dtype).eps
-    tilted = [along.abs() - hinges.to(a.dtype), *((x @ normal) / x.norm(dim=-1, keepdim=True).clamp(min=1.0) for x in vectors)]
+    tilted = [along.abs() - hinges.to(a.dtype), *((x @ normal) / x.norm().clamp(min=1.0) for x in vectors)]
     if any(bool((x.abs() > tiny).any()) for x in tilted):
         return None
     inside = [torch.eye(2, dtype=a.dtype)]  # of the world, and of each node

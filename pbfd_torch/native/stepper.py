@@ -14,7 +14,8 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.native.core import Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
-from pbfd_torch.native.plan import NotCompiledError, Plan, planned
+from pbfd_torch.native.not_compiled import NotCompiledError
+from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks

@@ -14,7 +14,7 @@ namespace {
 constexpr double RADIUS = 0.1, MASS = 1.0, G = 9.81, DT = 0.01;
 constexpr int NQ = 7, NV = 6, WORLDS = 11, STEPS = 100;
 
-// the node; how many dofs each of its dofs rides on, and which; the candidate's node
+// the node; how many dofs each of its dofs rides on, and which; no point on a plane, one ball: on node 0, on plane 0
 const int whole[] = {-1, FREE, 0, 0, 1,
                      0, 1, 2, 3, 4, 5,
                      0, 0, 0, 0, 0, 0,
@@ -23,7 +23,7 @@ const int whole[] = {-1, FREE, 0, 0, 1,
                      0, 1, 2, 0, 0, 0,
                      0, 1, 2, 3, 0, 0,
                      0, 1, 2, 3, 4, 0,
-                     0};
+                     0, 1, 0, 0};
 
 std::vector<double> numbers() {
   const double inf = std::numeric_limits<double>::infinity(), second = MASS * RADIUS * RADIUS / 5;
@@ -35,8 +35,8 @@ std::vector<double> numbers() {
   for (int what = 0; what < 4; what++) each(0, 0);  // no springs, damping, rotors, dry friction
   each(-inf, -inf), each(inf, inf), each(0, 0);
   n.insert(n.end(), {0, 0, 0, 1, 0, 0, 0});
-  n.insert(n.end(), {0, 0, 0, RADIUS, 0, MASS * G / 1e-6, 0.5, 0, 0, 1, 0, 0.01});
-  n.insert(n.end(), {0, 0, -G, RADIUS, 0.1, 1e-3, 1, 1e-3});
+  n.insert(n.end(), {0, 0, -G, RADIUS, 1, 1e-3});
+  n.insert(n.end(), {0, 0, 0, RADIUS, 0, MASS * G / 1e-6, 0.5, 0.01, 0.1, 1e-3, 0, 0, 1, 0});
   return n;
 }
 
@@ -55,7 +55,7 @@ struct Worlds {
 // Worlds `first` … of all, each dropped from its own height and set spinning.
 Worlds dropped(int first, int count) {
   const std::vector<double> real = numbers();
-  const pbfd_plan plan{8, 3, 0, 1, NQ, NV, 0, 1, whole, real.data()};
+  const pbfd_plan plan{8, 3, 0, 1, NQ, NV, 0, 1, 1, whole, real.data()};
   CHECK(pbfd_whole_numbers(&plan) == long(sizeof(whole) / sizeof(int)));
   CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);

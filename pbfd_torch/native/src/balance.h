@@ -23,29 +23,29 @@ template <class V, class N, int D = 3> struct Balance {
   V* arms;  // κ Σ m p̃ of all that a node moves
   // at the configuration
   Poses<V> now;
-  V *axes, *chord_axes, *chord, *residual, *slopes, *matrix, *turns_;
+  V *axes, *chord_axes, *chord, *residual, *slopes, *matrix;
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
-  bool* turned;
+  Contacts<V, N, D> contacts;
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
-    return s.nodes * (3 * (D * D + D) + 2 * D + 3) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + in_registers<bool>(s.nodes) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
+    return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
+           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
   }
   template <class X> static X* taken(Arena<V>& arena, int count) {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
   }
 
-  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene) {
+  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), turns_ = arena.take(3 * plan.nodes);
+    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
-    pushes = taken<Push<V, D>>(arena, plan.nodes), turned = taken<bool>(arena, plan.nodes);
+    pushes = taken<Push<V, D>>(arena, plan.nodes);
     for (int i = 0; i < plan.nv * plan.nv; i++) matrix[i] = V(0);  // dofs on different branches stay uncoupled
   }
 
@@ -64,7 +64,7 @@ template <class V, class N, int D = 3> struct Balance {
       pushes[k].any = false;
     }
     pull_all();
-    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns_, turned);
+    contacts.look(now), contacts.press(pushes);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
     for (int i = 0; i < plan.nv; i++) residual[i] = slopes[i] = V(0);

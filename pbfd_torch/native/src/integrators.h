@@ -53,6 +53,7 @@ template <class V, class N, int D> inline void begin_energy_momentum(Balance<V, 
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
   b.begin();
+  b.contacts.begin(b.start, b.dt);
 }
 
 }  // namespace pbfd

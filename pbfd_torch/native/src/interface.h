@@ -15,7 +15,7 @@ PBFD_FUNCTION const char* pbfd_target();
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too; `each`: every world has its own numbers,
 // [worlds, count].
 struct pbfd_plan {
-  int bytes, dimension, each, nodes, nq, nv, nu, candidates;
+  int bytes, dimension, each, nodes, nq, nv, nu, candidates, planes;
   const int* whole;
   const void* real;
 };
@@ -47,3 +47,7 @@ PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 
 // Energy–momentum steps by Newton's method from the guess or from θ_n.
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
+
+// The balance of forces that steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
+// J [worlds, nv · nv].
+PBFD_FUNCTION void pbfd_balance(const pbfd_plan*, const pbfd_steps*, const void* q, void* residual, void* jacobian, void* room);

@@ -1,6 +1,7 @@
 // The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
 #include "interface.h"
 
+#include "inspection.h"
 #include "machine.h"
 #include "target.h"
 
@@ -14,7 +15,9 @@ const char* pbfd_target() { return target; }
 
 namespace {
 
-Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
+Sizes sizes(const pbfd_plan* p) {
+  return {{p->candidates, p->planes}, p->nodes, p->nq, p->nv, p->nu};
+}
 
 template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
@@ -30,6 +33,18 @@ template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, cons
       s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
   machine.scheme.surplus_allowed = V(T(s->surplus));
   machine.run(journey, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
+}
+
+template <class T, int D>
+void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
+  auto row = [](const void* array, long world, int count) { return static_cast<const T*>(array) + world * count; };
+  const int own = p->each ? Plan<T, D>::real_numbers(sizes(p)) : 0;
+  for (int w = s->first; w < s->last; w++) {
+    const Plan<T, D> plan(sizes(p), p->whole, row(p->real, w, own));
+    inspect(plan, row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq),
+            T(s->dt), Arena<T>{static_cast<T*>(room)}, static_cast<T*>(residual) + long(w) * p->nv,
+            static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
+  }
 }
 
 // A single world is spared the work of lanes that nobody needs.
@@ -69,4 +84,12 @@ void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
     plane ? energy_momentum_of<double, 2>(p, s, room) : energy_momentum_of<double, 3>(p, s, room);
   else
     plane ? energy_momentum_of<float, 2>(p, s, room) : energy_momentum_of<float, 3>(p, s, room);
+}
+
+void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
+  const bool plane = p->dimension == 2;
+  if (p->bytes == 8)
+    (plane ? balance_of<double, 2> : balance_of<double, 3>)(p, s, q, residual, jacobian, room);
+  else
+    (plane ? balance_of<float, 2> : balance_of<float, 3>)(p, s, q, residual, jacobian, room);
 }

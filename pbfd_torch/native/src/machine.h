@@ -167,17 +167,10 @@ template <class V, class N, int D = 3> struct Machine {
     visit(before.lag, after.lag), visit(before.average, after.average);
   }
 
-  // What is too deep, and who touches something and has turned by more than a quarter turn (contact/hazards.py).
+  // Of contacts and limits (contact/hazards.py).
   void look_for_hazards(M& deep, M& far) const {
-    const Balance<V, N, D>& b = newton.balance;
     deep = far = M(false);
-    for (int i = 0; i < plan.candidates; i++) {
-      const int k = plan.carrier[i];
-      V c[D], turned(0);
-      const V depth = V(plan.radius[i]) + V(plan.margin[i]) - height(plan, i, b.now, c);
-      for (int j = 0; j < D * D; j++) turned = fma(b.now.rotation[D * D * k + j], b.start.rotation[D * D * k + j], turned);
-      deep = deep | (depth > V(plan.deep[i])), far = far | ((depth > V(0)) & (turned < V(D - 2)));
-    }
+    newton.balance.contacts.look_for_hazards(deep, far);
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k];

@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, sinks, faster, stiffness, mu, size, along, square, cube, fourth;
+  V depth, start, steepness, sinks, faster, stiffness, mu, range, width, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -20,9 +20,9 @@ template <class V, class N, int D = 3> struct Outlook {
   Coming<V>* coming;
   Stop<V>* stops;
   V *twist, *drift;  // [6] per node
-  int contacts = 0, limits = 0;
+  int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
-  V range, width, limit_range;
+  V limit_range;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -33,55 +33,17 @@ template <class V, class N, int D = 3> struct Outlook {
     twist = arena.take(6 * s.nodes), drift = arena.take(6 * s.nodes);
   }
 
-  // Along d from q, where the work is `work` and its slope dᵀJd is `curve`. `where`: for which lanes it counts.
-  void look(const Balance<V, N, D>& b, const V* q, const V* d, V work, V curve, typename Kind<V>::Mask where) {
+  // Along d from q, where the work is `start` and its slope dᵀJd is `curve`. `where`: for which lanes it counts.
+  void look(Balance<V, N, D>& b, const V* q, const V* d, V start, V curve, typename Kind<V>::Mask where) {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
-    base = work, slope = curve, contacts = limits = 0;
-    range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt, limit_range = V(plan.limit_release[0]) * b.dt;
+    count = limits = 0, base = slope = zero;
+    limit_range = V(plan.limit_release[0]) * b.dt;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
-    for (int i = 0; i < plan.candidates; i++) {
-      const int k = plan.carrier[i];
-      V c[D], before[D], n[D];
-      const V radius = V(plan.radius[i]), reach = radius + V(plan.margin[i]);
-      const V depth = reach - height(plan, i, b.now, c);
-      for (int j = 0; j < D; j++) n[j] = V(plan.normal[D * i + j]);
-      const V *t = twist + S * k, *e = drift + S * k;
-      V v[D], a[D], bent[D];
-      swing<D>(t, c, v), swing<D>(e, c, a);
-      for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
-      swing<D>(t, v, bent);
-      for (int j = 0; j < D; j++) a[j] += bent[j];
-      const V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
-      if (!any((depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) continue;
-      Coming<V>& out = coming[contacts++];
-      out.depth = depth, out.start = reach - height(plan, i, b.start, before), out.sinks = sinks, out.faster = faster;
-      out.stiffness = V(plan.firmness[i]), out.mu = V(plan.grip[i]);
-      V moved[D], first[D], second[D];
-      for (int j = 0; j < D; j++) moved[j] = c[j] - before[j];
-      if (any(plan.radius[i] > N(0))) {  // the surface moves by φ × s beside its centre, s = −ρ n
-        V phi[T], beside[D];
-        rotation_between<D>(b.now.rotation + D * D * k, b.start.rotation + D * D * k, phi);
-        swing<D>(phi, n, beside);
-        for (int j = 0; j < D; j++) moved[j] = fma(-radius, beside[j], moved[j]);
-        swing<D>(t, n, beside);
-        for (int j = 0; j < D; j++) v[j] = fma(-radius, beside[j], v[j]);
-        swing<D>(e, n, beside);
-        for (int j = 0; j < D; j++) a[j] = fma(-radius, beside[j], a[j]);
-      }
-      const V lifted = dot<D>(moved, n);
-      for (int j = 0; j < D; j++) {
-        moved[j] = fma(-lifted, n[j], moved[j]);
-        first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
-      }
-      out.size = dot<D>(moved, moved), out.along = dot<D>(moved, first);
-      out.square = dot<D>(first, first) + dot<D>(moved, second), out.cube = dot<D>(first, second);
-      out.fourth = dot<D>(second, second);
-      V df;
-      base -= of_contact(out, zero, df);
-      slope -= df;
-    }
+    each_kind(plan.contact, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) foresee(b.contacts, pair, i, where);
+    });
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k], c = plan.q[k];
@@ -91,23 +53,55 @@ template <class V, class N, int D = 3> struct Outlook {
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
         out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
-        V df;
-        base -= of_limit(out, zero, df);
-        slope -= df;
       }
     }
+    V known;
+    base = start - work(zero, known), slope = curve - known;
   }
 
   // φ and dφ/da at a length.
   V work(V a, V& df) const {
     V f = fma(a, slope, base), d;
     df = slope;
-    for (int i = 0; i < contacts; i++) f += of_contact(coming[i], a, d), df += d;
+    for (int i = 0; i < count; i++) f += of_contact(coming[i], a, d), df += d;
     for (int i = 0; i < limits; i++) f += of_limit(stops[i], a, d), df += d;
     return f;
   }
 
  private:
+  // A candidate whose surface moves on a parabola, c + s with s held on the body; the normal is held but for the depth.
+  template <class Pair> void foresee(Contacts<V, N, D>& contacts, Pair pair, int i, typename Kind<V>::Mask where) {
+    using Surface = typename Pair::Surface;
+    using Support = typename Pair::Support;
+    const int k = contacts.candidates.carrier[i];
+    const V zero(0), *t = twist + S * k, *e = drift + S * k;
+    Touching<V, D> at;
+    const V *c = at.center, *n = at.solid.normal;
+    contacts.center(i, contacts.now, at.center);
+    at.depth = contacts.depth(pair, i, contacts.now, c, at.solid);
+    V v[D], a[D];
+    swing<D>(t, c, v), swing<D>(e, c, a);
+    for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
+    add_swing<D>(t, v, a);
+    V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
+    if (!any((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) return;
+    contacts.touch(pair, i, at);
+    Coming<V>& out = coming[count++];
+    if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
+    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = faster, out.steepness = at.solid.steepness;
+    out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
+    V u[D], first[D], second[D];
+    at.template travel<Surface, Support>(u);
+    const V lifted = dot<D>(u, n);
+    for (int j = 0; j < D; j++) {
+      u[j] = fma(-lifted, n[j], u[j]);
+      first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
+    }
+    out.size = dot<D>(u, u), out.along = dot<D>(u, first);
+    out.square = dot<D>(first, first) + dot<D>(u, second), out.cube = dot<D>(first, second);
+    out.fourth = dot<D>(second, second);
+  }
+
   // V̇ = Σ ṡ_i d_i, ṡ_i = ad(V_carrier) s_i, of all nodes.
   void drifts(const Plan<N, D>& plan, const V* axes, const V* d) {
     for (int k = 0; k < plan.nodes; k++) {
@@ -133,15 +127,15 @@ template <class V, class N, int D = 3> struct Outlook {
   }
 
   V of_contact(const Coming<V>& c, V a, V& df) const {
-    const V deep = c.depth + a * fma(V(0.5) * a, c.faster, c.sinks), speed = fma(a, c.faster, c.sinks);
+    const V deep = fma(c.steepness * a, fma(V(0.5) * a, c.faster, c.sinks), c.depth), speed = fma(a, c.faster, c.sinks);
     V push, rises, factor, falls;
-    releasing(c.stiffness, deep, c.start, range, push, rises);
+    releasing(c.stiffness, deep, c.start, c.range, push, rises);
     const V square = c.size + a * (V(2) * c.along + a * (c.square + a * (c.cube + V(0.25) * a * c.fourth)));
-    slip_factor(sqrt(max(square, V(0))), width, factor, falls);
+    slip_factor(sqrt(max(square, V(0))), c.width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    const V drags = (rises * speed * factor + push * falls * on) * on + push * factor * further;
-    df = rises * speed * speed + push * c.faster + c.mu * drags;
+    const V grows = rises * c.steepness * speed, drags = (grows * factor + push * falls * on) * on + push * factor * further;
+    df = grows * speed + push * c.faster + c.mu * drags;
     return push * speed + c.mu * push * factor * on;
   }
 

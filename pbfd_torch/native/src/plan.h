@@ -4,7 +4,7 @@
 // The numbers are those of all worlds (N a scalar) or every world's own (N like V). `Plan` walks once over two arrays that
 // native/plan.py has written in this order: this file and that one change together.
 #pragma once
-#include "vectors.h"
+#include "candidates.h"
 
 namespace pbfd {
 
@@ -13,8 +13,8 @@ inline int coordinates(int kind) { return kind == FREE ? 7 : kind == BALL ? 4 : 
 inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; }
 inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0; }  // of these, the first
 
-struct Sizes {
-  int nodes, nq, nv, nu, candidates;
+struct Sizes : CandidateSizes {
+  int nodes, nq, nv, nu;
 };
 
 template <class N, int D = 3> struct Plan : Sizes {
@@ -36,14 +36,11 @@ template <class N, int D = 3> struct Plan : Sizes {
   // actuators
   const int *actuated_q, *actuated_v;
   const N *gear, *gain, *bias, *stiffness, *resistance, *least_control, *most_control, *least_force, *most_force;
-  // contact candidates, each against one half-space
-  const int* carrier;  // node
-  const N *position, *radius, *margin, *firmness, *grip, *normal, *offset;  // [D] on the node, …, [D] in the world
-  const N *deep;  // from which depth on it is a hazard
+  Candidates<N, D> contact;
   // the scene
   const N *gravity;  // [D]
   const N *reach;    // [m]
-  const N *release, *slip_speed, *limit_release, *dry_speed;
+  const N *limit_release, *dry_speed;
 
   Plan() = default;
   Plan(Sizes sizes, const int* ints, const N* numbers) : Sizes(sizes) {
@@ -52,7 +49,6 @@ template <class N, int D = 3> struct Plan : Sizes {
     parent = whole(nodes), kind = whole(nodes), q = whole(nodes), v = whole(nodes), plain = whole(nodes);
     depth = whole(nv), above = whole(nv * nv);
     actuated_q = whole(nu), actuated_v = whole(nu);
-    carrier = whole(candidates);
     frame = real(D * D * nodes), origin = real(D * nodes), reference = real(nodes), sense = real(nodes);
     mass = real(nodes), center = real(D * nodes), second = real(D * D * nodes), carried = real(nodes);
     scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
@@ -60,14 +56,13 @@ template <class N, int D = 3> struct Plan : Sizes {
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
-    position = real(D * candidates), radius = real(candidates), margin = real(candidates), firmness = real(candidates);
-    grip = real(candidates), normal = real(D * candidates), offset = real(candidates), deep = real(candidates);
-    gravity = real(D), reach = real(1), release = real(1), slip_speed = real(1), limit_release = real(1), dry_speed = real(1);
+    gravity = real(D), reach = real(1), limit_release = real(1), dry_speed = real(1);
+    contact = Candidates<N, D>(*this, ints, numbers);
   }
 
-  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.candidates; }
+  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + Candidates<N, D>::whole_numbers(s); }
   static int real_numbers(Sizes s) {
-    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + (6 + 2 * D) * s.candidates + D + 5;
+    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + D + 3 + Candidates<N, D>::real_numbers(s);
   }
 };
 

@@ -39,6 +39,13 @@ template <int D, class V> inline void swing(const V* w, const V* x, V* out) {
   }
 }
 
+// out += ω × x
+template <int D, class V> inline void add_swing(const V* w, const V* x, V* out) {
+  V moved[D];
+  swing<D>(w, x, moved);
+  for (int i = 0; i < D; i++) out[i] += moved[i];
+}
+
 // ω × x = [−[x]×] ω, [D × turns(D)].
 template <int D, class V> inline void arms(const V* x, V* out) {
   if constexpr (D == 3) {

@@ -1,0 +1,21 @@
+// The balance of forces of a step at any configuration, for those who judge it.
+#pragma once
+#include "integrators.h"
+
+namespace pbfd {
+
+// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control.
+template <class T, int D>
+inline void inspect(const Plan<T, D>& plan, const T* q, const T* v, const T* control, const T* at, T dt, Arena<T> arena, T* residual,
+                    T* matrix) {
+  Balance<T, T, D> balance(plan, arena);
+  T* room = arena.take(18 * plan.nodes);
+  balance.dt = dt;
+  for (int j = 0; j < plan.nu; j++) balance.control[j] = control[j];
+  begin_energy_momentum(balance, q, v, room);
+  balance.evaluate(at), balance.assemble(at, true);
+  for (int j = 0; j < plan.nv; j++) residual[j] = balance.residual[j];
+  for (int j = 0; j < plan.nv * plan.nv; j++) matrix[j] = balance.matrix[j];
+}
+
+}  // namespace pbfd

@@ -1,0 +1,113 @@
+// The force of a candidate that touches, and how it answers (terms/touching.py): N n − G u at p = c + s, where u = (1 − nnᵀ) m is what
+// it slips over the step, m = c − c₀ + ϕ × s (METHOD §4), ϕ the rotation since its start.
+//
+// What moves is told by (ω, w), w the velocity of the centre: n answers with B w, s and h as supports.h says, the depth with
+// −δd = ‖∇φ‖ n·w − δh.
+#pragma once
+#include "friction.h"
+#include "loads.h"
+#include "release.h"
+#include "supports.h"
+#include "surfaces.h"
+
+namespace pbfd {
+
+template <class V, int D> struct Touching {
+  V center[D], moved[D];  // c, c − c₀
+  Beside<V, D> solid;
+  V bend[D * D];
+  Arm<V, D> arm;
+  V depth, start;          // at the end of the step and at its beginning
+  V firmness, grip, range, width;  // C⊥, μ; release speed and slip speed × Δt
+  const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
+
+  // m
+  template <class Surface, class Support> void travel(V* out) const {
+    for (int j = 0; j < D; j++) out[j] = moved[j];
+    if constexpr (Support::rolls) add_swing<D>(turn, arm.s, out);
+  }
+};
+
+template <class Surface, class Support, class V, int D> inline void press(const Touching<V, D>& t, Push<V, D>& out) {
+  constexpr int T = turns(D), S = T + D;
+  const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
+  V m[D], u[D], p[D], f[D];
+  t.template travel<Surface, Support>(m);
+  const V lifted = dot<D>(m, n);
+  for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], m[j]), p[j] = Support::rolls ? c[j] + s[j] : c[j];
+  V push, rises, factor, falls;
+  releasing(t.firmness, t.depth, t.start, t.range, push, rises);
+  slip_factor(sqrt(dot<D>(u, u)), t.width, factor, falls);
+  const V drag = t.grip * push * factor, by_depth = t.grip * rises * factor, by_size = t.grip * push * falls;
+  for (int j = 0; j < D; j++) f[j] = fma(push, n[j], -(drag * u[j]));
+
+  // answers: −δf of a motion that makes the slip grow by `slips` and the depth fall by `sinks`, but for what the normal's turn does
+  auto answer = [&](const V* slips, V sinks, V* a) {
+    const V resists = fma(by_size, dot<D>(u, slips), -(by_depth * sinks)), presses = rises * sinks;
+    for (int j = 0; j < D; j++) a[j] = fma(n[j], presses, fma(drag, slips[j], u[j] * resists));
+  };
+  V by_turn[S * T], by_shift[S * D];  // of the torque about the world's origin and of the force
+  auto wrench = [&](int b, int columns, const V* a, const V* wandered, V* out) {
+    V torque[T], pulled[T];
+    lever<D>(p, a, torque);
+    if (wandered) lever<D>(f, wandered, pulled);
+    for (int j = 0; j < T; j++) out[columns * j + b] = wandered ? torque[j] + pulled[j] : torque[j];
+    for (int j = 0; j < D; j++) out[columns * (T + j) + b] = a[j];
+  };
+  for (int b = 0; b < D; b++) {  // w
+    V slips[D], a[D], sinks = n[b];
+    if constexpr (!Surface::exact) sinks = t.solid.steepness * sinks;
+    if constexpr (Surface::flat) {
+      for (int j = 0; j < D; j++) slips[j] = fma(-n[b], n[j], V(j == b));
+      answer(slips, sinks, a);
+      wrench(b, D, a, nullptr, by_shift);
+    } else {
+      V tilt[D], shifted[D], move[D];
+      for (int j = 0; j < D; j++) tilt[j] = t.bend[D * j + b], shifted[j] = t.arm.by_shift[D * j + b], move[j] = V(j == b);
+      add_swing<D>(t.turn, shifted, move);
+      if constexpr (Support::wanders) sinks = sinks - t.arm.reach_by_shift[b];
+      const V along = dot<D>(n, move) + dot<D>(m, tilt);
+      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], fma(-lifted, tilt[j], move[j]));
+      answer(slips, sinks, a);
+      for (int j = 0; j < D; j++) a[j] = fma(-push, tilt[j], a[j]);
+      wrench(b, D, a, shifted, by_shift);
+    }
+  }
+  if constexpr (Support::rolls) {
+    V carried[D * T];  // a material point at p would move by ω × s
+    arms<D>(s, carried);
+    for (int b = 0; b < T; b++) {  // ω
+      V column[T], slips[D], a[D], wandered[D], sinks = zero;
+      for (int j = 0; j < T; j++) column[j] = t.rolling[T * j + b];
+      for (int j = 0; j < D; j++) wandered[j] = -carried[T * j + b];
+      swing<D>(column, s, slips);
+      if constexpr (Support::wanders) {
+        V shifted[D];
+        for (int j = 0; j < D; j++) shifted[j] = t.arm.by_turn[T * j + b], wandered[j] += shifted[j];
+        add_swing<D>(t.turn, shifted, slips);
+        sinks = -t.arm.reach_by_turn[b];
+      }
+      const V along = dot<D>(n, slips);
+      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], slips[j]);
+      answer(slips, sinks, a);
+      wrench(b, T, a, wandered, by_turn);
+    }
+  }
+
+  out.open();
+  for (int j = 0; j < D; j++) {
+    out.force[j] -= f[j];
+    for (int b = 0; b < D; b++) out.moment[D * j + b] = fma(-f[j], p[b], out.moment[D * j + b]);
+  }
+  for (int j = 0; j < S; j++) {  // w = v + ω × c
+    V *row = out.stiffness + S * j, turned[T];
+    const V* shift = by_shift + D * j;
+    lever<D>(c, shift, turned);
+    for (int b = 0; b < T; b++) row[b] += turned[b];
+    for (int b = 0; b < D; b++) row[T + b] += shift[b];
+    if constexpr (Support::rolls)
+      for (int b = 0; b < T; b++) row[b] += by_turn[T * j + b];
+  }
+}
+
+}  // namespace pbfd
