@@ -21,7 +21,10 @@ NUMBERS = ("gained", "surplus", "peak")
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates", "planes")),
+        *(
+            (name, ctypes.c_int)
+            for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates", "planes", "solids", "samples", "forms")
+        ),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )
@@ -97,7 +100,7 @@ class Core:
         return after, solution, refused.to(torch.bool)
 
     def balance(self, state: Velocities, control: Tensor | None, terms: Terms, q: Tensor) -> tuple[Tensor, Tensor]:
-        """The balance of forces that the step from a state solves at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
+        """Of the step from a state, at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
         batch, nv = tuple(state.q.shape[:-1]), self.plan.sizes[2]
         step, _kept = self._step(state, control, terms)
         at = _last(q, batch, step.worlds)

@@ -16,6 +16,7 @@ from pbfd_torch.native.plan_contact import Candidates
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -23,7 +24,8 @@ from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
-TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Contact)
+CONTACTS = (Contact, CurvedContact)
+TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, *CONTACTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +121,7 @@ class _Terms:
             kind = type(inner)
             if kind not in TERMS:
                 raise unknown(kind.__name__)
-            if kind in seen and kind is not Contact:
+            if kind in seen and kind not in CONTACTS:
                 raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
             self._take(a, inner)

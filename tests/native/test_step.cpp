@@ -14,7 +14,8 @@ namespace {
 constexpr double RADIUS = 0.1, MASS = 1.0, G = 9.81, DT = 0.01;
 constexpr int NQ = 7, NV = 6, WORLDS = 11, STEPS = 100;
 
-const int whole[] = {-1, FREE, 0, 0, 0, 1, 0, 0};  // no point on a plane, one ball: on node 0, on plane 0
+// no point on a plane, one ball: on node 0, on plane 0
+const int whole[] = {-1, FREE, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0};
 
 std::vector<double> numbers() {
   const double inf = std::numeric_limits<double>::infinity(), second = MASS * RADIUS * RADIUS / 5;
@@ -45,7 +46,7 @@ struct Worlds {
 // Worlds `first` … of all, each dropped from its own height and set spinning.
 Worlds dropped(int first, int count) {
   const std::vector<double> real = numbers();
-  const pbfd_plan plan{8, 1, NQ, NV, 0, 1, 1, whole, real.data()};
+  const pbfd_plan plan{8, 1, NQ, NV, 0, 1, 1, 0, 0, 0, whole, real.data()};
   CHECK(pbfd_whole_numbers(&plan) == sizeof(whole) / sizeof(int));
   CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);

@@ -1,7 +1,7 @@
 // The kinds of pairs that touch: in this order candidates are sorted (native/plan_contact.py).
 #pragma once
+#include "grids.h"
 #include "supports.h"
-#include "surfaces.h"
 
 namespace pbfd {
 
@@ -18,7 +18,14 @@ template <class N, class F> inline void each_kind(const Candidates<N>& c, F&& vi
     if (first < last) visit(pair, first, last);
     first = last;
   };
-  next(Pair<Plane, Point>()), next(Pair<Plane, Ball>());
+  next(Pair<Plane, Point>()), next(Pair<Plane, Ball>()), next(Pair<Plane, Ellipsoid>());
+  auto beside_others = [&](auto support) {  // a point there is a ball without a radius
+    using Support = decltype(support);
+    next(Pair<Placed<Globe>, Support>()), next(Pair<Placed<Pill>, Support>());
+    next(Pair<Placed<Block>, Support>()), next(Pair<Placed<Drum>, Support>());
+    next(Pair<Placed<Terrain>, Support>()), next(Pair<Placed<Sampled>, Support>());
+  };
+  beside_others(Ball()), beside_others(Ellipsoid());
 }
 
 }  // namespace pbfd

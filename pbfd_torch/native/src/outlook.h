@@ -84,12 +84,29 @@ template <class V, class N> struct Outlook {
     cross(e, c, a);
     for (int j = 0; j < 3; j++) a[j] += e[3 + j];
     add_cross(t, v, a);
-    V sinks = -dot(v, n), faster = -dot(a, n);
-    if (!any((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) return;
-    contacts.touch(pair, i, at);
+    if constexpr (!Surface::flat || Support::wanders) {
+      contacts.touch(pair, i, at);
+      add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
+    }
+    if constexpr (Support::wanders) {
+      const V bulge = Support::bulge(contacts.candidates, i, contacts.now.rotation + 9 * k, n, at.arm, t);
+      for (int j = 0; j < 3; j++) a[j] = fma(-bulge, n[j], a[j]);
+    }
+    const V sinks = -dot(v, n), faster = -dot(a, n);
+    V deepens = faster;
+    if constexpr (!Surface::flat) {
+      V tilt[3];
+      times(at.bend, v, tilt);
+      deepens -= dot(tilt, v);
+    }
+    const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
+    if (!any((at.depth + grows > zero) & where)) return;
+    if constexpr (Surface::flat && !Support::wanders) {
+      contacts.touch(pair, i, at);
+      if constexpr (Support::rolls) add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
+    }
     Coming<V>& out = coming[count++];
-    if constexpr (Support::rolls) add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
-    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = faster, out.steepness = at.solid.steepness;
+    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
     V u[3], first[3], second[3];
     at.template travel<Surface, Support>(u);
