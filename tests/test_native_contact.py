@@ -19,11 +19,7 @@ from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import Velocities
-from pbfd_torch.integrators.integrator import fresh
 from pbfd_torch.native.library import library
-from pbfd_torch.native.stepper import NativeStepper
-from pbfd_torch.solvers.objective import Status
-from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -32,10 +28,10 @@ from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
+from tests.native_parity import DT, gaps, require_balance, require_steps, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
-DT = 0.01
 GROUND, WALL = HalfSpace(), HalfSpace("wall", (-0.8, 0.0, 0.6), -0.1)
 Solid = HalfSpace | Obstacle
 
@@ -46,6 +42,18 @@ def two_links() -> Articulation:
     free, hinge = Joint("free", JointKind.FREE), Joint("hinge", JointKind.HINGE, (0.6, 0.0, 0.8))
     first = Link("first", joints=(free,), mass=1.0, inertia=eye, com=(0.01, 0.0, 0.02))
     return Articulation.from_links([first, Link("second", "first", (0.3, 0.0, 0.1), joints=(hinge,), mass=0.5, inertia=eye)])
+
+
+def require_touching(scene: Scene, state: Velocities, q: Tensor) -> None:
+    """Something touches in a third of the worlds at least."""
+    assert float((Simulator(scene, DT).eager.objective(state).push(q) > 0).double().mean()) > 0.3
+
+
+def require_alike(scene: Scene, worlds: int, speed: float = 0.3) -> None:
+    """The same forces and derivatives beside all solids."""
+    state, q = beside(scene, worlds, speed=speed)
+    require_touching(scene, state, q)
+    require_balance(scene, state, q)
 
 
 def touching(shapes: Sequence[Shape], solids: Sequence[Solid], kind: Any = Contact, dtype: torch.dtype = torch.float64) -> Scene:
@@ -89,68 +97,14 @@ def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tupl
     return resting(a, retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v), q
 
 
-def resting(a: Articulation, q: Tensor, v: Tensor) -> Velocities:
-    """A state that has felt nothing yet."""
-    zero, nothing = torch.zeros_like(q[..., 0]), torch.zeros_like(v)
-    return Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v, gained=zero, surplus=zero, peak=zero)
-
-
-def require_balance(scene: Scene, state: Velocities, q: Tensor, exact: float = 1e-9) -> None:
-    """The core's r and J are the reference's, each world's by its own largest entry; and something touches in many worlds."""
-    residual, jacobian = gaps(scene, state, q)
-    assert float(residual.max()) < exact, residual.argmax()
-    assert float(jacobian.max()) < exact, jacobian.argmax()
-
-
-def gaps(scene: Scene, state: Velocities, q: Tensor) -> tuple[Tensor, Tensor]:
-    """How far the core's r and J are from the reference's in each world, where something touches in a third of them at least."""
-    simulator = Simulator(scene, DT)
-    native = NativeStepper(simulator.eager)
-    residual, jacobian = native._core.balance(state, None, native._terms, q)
-    objective = simulator.eager.objective(state)
-    balance = objective.evaluate(q)
-    assert float((objective.push(q) > 0).double().mean()) > 0.3
-    pairs = ((residual, balance.residual), (jacobian.flatten(-2), balance.jacobian.flatten(-2)))
-    first, second = ((ours - theirs).abs().amax(-1) / theirs.abs().amax(-1) for ours, theirs in pairs)
-    return first, second
-
-
-def require_steps(scene: Scene, worlds: int = 12, steps: int = 5) -> None:
-    """Steps end where the reference's do, and a world goes alone as in a batch."""
-    simulator = Simulator(scene, DT)
-    native = NativeStepper(simulator.eager)
-    state, _ = beside(scene, worlds, 5)
-    state = simulator.initial_state(state.q, state.v)
-    direct = same = 0
-    for _ in range(steps):
-        after, solution, _ = native.made(state, None)
-        objective = simulator.eager.objective(state)
-        plain = solution.status == int(Status.SOLVED)
-        error = objective.error(objective.evaluate(after.q), 1e-9)
-        assert bool((error[plain] <= 1e-9).all())
-        reference, eager, _ = simulator.eager.made(state, None)
-        both = plain & (eager.status == int(Status.SOLVED))
-        alike = both & ((after.q - reference.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        for field in ("v", "push", "steady", "lag", "surplus", "hazards"):
-            assert torch.allclose(getattr(after, field)[alike] + 0.0, getattr(reference, field)[alike] + 0.0, 1e-5, 1e-5), field
-        state = reference
-    assert same >= 0.97 * direct > 0
-    whole, _, _ = native.made(state, None)
-    for index in (torch.tensor([3]), torch.tensor([worlds - 1, 0, 3])):
-        part, _, _ = native.made(state.take(Worlds((worlds,), index)), None)
-        assert torch.equal(part.q, whole.q[index])
-        assert torch.equal(part.v, whole.v[index])
-
-
 @pytest.mark.parametrize(
     "shapes", [(Point(), Box((0.05, 0.04, 0.03))), (Sphere(0.05), Capsule(0.03, 0.1)), (Point(), Sphere(0.05))]
 )
 def test_half_spaces(shapes: Sequence[Shape]) -> None:
     """Contacts with different release and slip speeds too."""
     scene = touching(shapes, (GROUND, WALL))
-    require_balance(scene, *beside(scene, 45))
-    require_steps(scene)
+    require_alike(scene, 45)
+    require_steps(scene, beside(scene, 12, 5)[0])
 
 
 @dataclass(frozen=True)
@@ -177,8 +131,8 @@ BALLS, CURVED = (Point(), Sphere(0.05), Sphere(0.02)), (Ellipsoid((0.08, 0.05, 0
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_balls_on_solids(solid: str) -> None:
     scene = touching(BALLS, (SOLIDS[solid], GROUND))
-    require_balance(scene, *beside(scene, 240))
-    require_steps(scene)
+    require_alike(scene, 240)
+    require_steps(scene, beside(scene, 12, 5)[0])
 
 
 @pytest.mark.parametrize("solid", CONVEX)
@@ -194,14 +148,14 @@ def test_fast_balls_do_not_pass_through(solid: str) -> None:
 @pytest.mark.parametrize("shape", CURVED)
 def test_curved_bodies_on_half_spaces(shape: Shape) -> None:
     scene = touching((shape,), (GROUND, WALL), CurvedContact)
-    require_balance(scene, *beside(scene, 120))
-    require_steps(scene)
+    require_alike(scene, 120)
+    require_steps(scene, beside(scene, 12, 5)[0])
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_curved_bodies_on_solids(solid: str) -> None:
     scene = touching(CURVED, (SOLIDS[solid],), CurvedContact)
-    require_balance(scene, *beside(scene, 240))
+    require_alike(scene, 240)
 
 
 def free_body(shape: Shape, solid: Solid, kind: Any = Contact) -> Scene:
@@ -241,6 +195,7 @@ def test_borders(shape: Shape, solid: Obstacle, places: Sequence[tuple[float, fl
     before = q.clone()
     before[:, 0] += 1e-4
     state = resting(scene.articulation, before, torch.zeros_like(q[:, 1:]))
+    require_touching(scene, state, q)
     assert float(gaps(scene, state, q)[0].max()) < 1e-6
 
 
@@ -256,4 +211,5 @@ def test_tips_and_rims() -> None:
         q = retract(a, a.rest.expand(len(turns), -1), tilted)
         q[:, 2] += contact.depth(place(a, q)).amax(-1) - 1e-3
         state = resting(a, retract(a, q, torch.full_like(tilted, 1e-4)), torch.zeros_like(tilted))
+        require_touching(scene, state, q)
         require_balance(scene, state, q)

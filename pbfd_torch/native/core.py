@@ -23,7 +23,7 @@ class _Plan(ctypes.Structure):
     _fields_ = (
         *(
             (name, ctypes.c_int)
-            for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates", "planes", "solids", "samples", "forms")
+            for name in ("bytes", "nodes", "nq", "nv", "nu", "candidates", "planes", "solids", "samples", "forms", "pushes")
         ),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),

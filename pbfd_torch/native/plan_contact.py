@@ -34,6 +34,12 @@ def link_frames(a: Articulation, link: Tensor) -> Tensor:
     return a.link_frame[link]
 
 
+def on_nodes(a: Articulation, link: Tensor, points: Tensor) -> Tensor:
+    """Points of links `[n, 3]` as they are on the nodes, `[n, 3]` [m]."""
+    frame = link_frames(a, link)
+    return (frame[:, :3, :3] @ points[..., None]).squeeze(-1) + frame[:, :3, 3]
+
+
 @dataclass
 class Candidates:
     """Of all contact terms.
@@ -89,9 +95,8 @@ class Candidates:
                 raise _differing(name)
             return number.expand(len(nodes))
 
-        frame = link_frames(a, term.link)
         numbers = (
-            (frame[:, :3, :3] @ term.position[..., None]).squeeze(-1) + frame[:, :3, 3],
+            on_nodes(a, term.link, term.position),
             term.radius,
             term.margin,
             each(law.stiffness, 0.0) * each(term.firm, 1.0),
@@ -104,7 +109,7 @@ class Candidates:
             return
         solid, first = self._solid(a, term, name), self.sizes[-1]
         if isinstance(term, CurvedContact):
-            self._add_forms(term, frame[:, :3, :3], name)
+            self._add_forms(a, term, name)
         for i in moving.tolist():
             if isinstance(term, CurvedContact):
                 support, form = ELLIPSOID, first + i
@@ -159,9 +164,10 @@ class Candidates:
         self.samples.append(coefficients.reshape(-1))
         return [first, *coefficients.shape, 1][:4]
 
-    def _add_forms(self, term: CurvedContact, turn: Tensor, name: str) -> None:
+    def _add_forms(self, a: Articulation, term: CurvedContact, name: str) -> None:
         if term.form.ndim != 3 or term.axis.ndim != 2:
             raise _differing(name)
+        turn = link_frames(a, term.link)[:, :3, :3]
         axis = (turn @ term.axis[..., None]).squeeze(-1)
         self.forms.append((turn @ term.form @ turn.mT, axis, term.lying.to(term.form.dtype)))
 

@@ -9,6 +9,7 @@
 #include "contact.h"
 #include "inertia.h"
 #include "joints.h"
+#include "pushes.h"
 
 namespace pbfd {
 
@@ -16,7 +17,7 @@ template <class V, class N> struct Balance {
   const Plan<N>& plan;
   // what is fixed in a step
   Poses<V> start, target;
-  V *q_start, *q_target, *control;
+  V *q_start, *q_target, *control, *limits;
   V dt, weight, share;  // share = 1: inertia works at the end of the step
   bool on_chord;
   // at the configuration
@@ -28,13 +29,14 @@ template <class V, class N> struct Balance {
 
   static int room(Sizes s) {  // in V, for the arena
     const int loads = int((sizeof(Pull<V>) + sizeof(Push<V>)) / sizeof(V)) + 2;
-    return s.nodes * (48 + loads) + 2 * s.nq + s.nu + 13 * s.nv + s.nv * s.nv + Contacts<V, N>::room(s);
+    return s.nodes * (48 + loads) + 2 * s.nq + s.nu + 14 * s.nv + s.nv * s.nv + Contacts<V, N>::room(s);
   }
 
   Balance(const Plan<N>& scene, Arena<V>& arena) : plan(scene), contacts(scene, arena) {
     start = Poses<V>::in(arena, plan), target = Poses<V>::in(arena, plan);
     now = Poses<V>::in(arena, plan), chord = Poses<V>::in(arena, plan);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
+    limits = arena.take(plan.nv);
     axes = arena.take(6 * plan.nv), chord_axes = arena.take(6 * plan.nv);
     residual = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     pulls = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
@@ -60,6 +62,7 @@ template <class V, class N> struct Balance {
         pulls[k].clear();  // a joint that only leads to others
     }
     contacts.look(now), contacts.press(pushes);
+    push_from_outside(plan, now, pushes);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) {
         pulls[plan.parent[k]].add(pulls[k]);
@@ -125,7 +128,7 @@ template <class V, class N> struct Balance {
     joint_loads(plan, steps(), q, static_cast<V*>(nullptr), matrix);
   }
 
-  JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }
+  JointStep<V> steps() const { return {q_start, q_target, control, limits, dt, weight}; }
 
  private:
   const V* inertial_axis(int j) const { return (on_chord ? chord_axes : axes) + 6 * j; }

@@ -50,6 +50,7 @@ template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, 
   b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5), b.on_chord = true;
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
+  stiffen_limits(b.plan, b.steps(), b.limits);
   b.contacts.begin(b.start, b.target, b.dt);
 }
 

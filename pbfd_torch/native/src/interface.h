@@ -14,7 +14,7 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it. Scalars are of 8 or 4 bytes, `numbers` and all arrays below alike.
 struct pbfd_plan {
-  int bytes, nodes, nq, nv, nu, candidates, planes, solids, samples, forms;
+  int bytes, nodes, nq, nv, nu, candidates, planes, solids, samples, forms, pushes;
   const int* whole;
   const void* real;
 };

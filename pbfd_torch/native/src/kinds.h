@@ -10,12 +10,15 @@ template <class A, class B> struct Pair {
   using Support = B;
 };
 
+// A function of its own, which the compiler takes by itself: many in one would be too large for it to be made well.
+template <class F, class P> [[gnu::noinline]] void apart(F& visit, P pair, int first, int last) { visit(pair, first, last); }
+
 // Visits each kind with the run of its candidates, `first` … `last` − 1: a loop of its own, without choices in it.
 template <class N, class F> inline void each_kind(const Candidates<N>& c, F&& visit) {
   int kind = 0, first = 0;
   auto next = [&](auto pair) {
     const int last = first + c.counts[kind++];
-    if (first < last) visit(pair, first, last);
+    if (first < last) apart(visit, pair, first, last);
     first = last;
   };
   next(Pair<Plane, Point>()), next(Pair<Plane, Ball>()), next(Pair<Plane, Ellipsoid>());

@@ -51,7 +51,7 @@ template <class V, class N> struct Outlook {
         const V past = sign * (q[c] - bound), speed = sign * d[i];
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
-        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
+        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), b.limits[i]};
       }
     }
     V known;

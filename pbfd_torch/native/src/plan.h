@@ -12,7 +12,7 @@ inline int coordinates(int kind) { return kind == FREE ? 7 : kind == BALL ? 4 : 
 inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; }
 
 struct Sizes : CandidateSizes {
-  int nodes, nq, nv, nu;
+  int nodes, nq, nv, nu, pushes;
 };
 
 template <class N> struct Plan : Sizes {
@@ -32,10 +32,13 @@ template <class N> struct Plan : Sizes {
   const int *actuated_q, *actuated_v;
   const N *gear, *gain, *bias, *stiffness, *resistance, *least_control, *most_control, *least_force, *most_force;
   Candidates<N> contact;
+  // forces from outside
+  const int* pushed;             // node
+  const N *push_point, *push;  // [3] on the node, [3] in the world
   // the scene
   const N *gravity;  // [3]
   const N *reach;    // [m]
-  const N *limit_release, *dry_speed;
+  const N *limit_release, *limit_per_force, *dry_speed;
 
   Plan() = default;
   Plan(Sizes sizes, const int* ints, const N* numbers) : Sizes(sizes) {
@@ -50,12 +53,16 @@ template <class N> struct Plan : Sizes {
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
-    gravity = real(3), reach = real(1), limit_release = real(1), dry_speed = real(1);
+    gravity = real(3), reach = real(1), limit_release = real(1), limit_per_force = real(1);
+    dry_speed = real(1);
     contact = Candidates<N>(*this, ints, numbers);
+    pushed = whole(pushes), push_point = real(3 * pushes), push = real(3 * pushes);
   }
 
-  static int whole_numbers(Sizes s) { return 4 * s.nodes + 2 * s.nu + Candidates<N>::whole_numbers(s); }
-  static int real_numbers(Sizes s) { return 29 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 6 + Candidates<N>::real_numbers(s); }
+  static int whole_numbers(Sizes s) { return 4 * s.nodes + 2 * s.nu + s.pushes + Candidates<N>::whole_numbers(s); }
+  static int real_numbers(Sizes s) {
+    return 29 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 7 + 6 * s.pushes + Candidates<N>::real_numbers(s);
+  }
 };
 
 // Memory that the caller owns, handed out piece by piece.
