@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
+from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.half_space import HalfSpace
+from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import Velocities
-from pbfd_torch.integrators.integrator import fresh
 from pbfd_torch.native.library import library
-from pbfd_torch.native.stepper import NativeStepper
-from pbfd_torch.solvers.objective import Status
-from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.kinematics import place, retract
+from tests.bodies import diagonal
+from tests.native_parity import DT, gaps, require_balance, require_steps, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
-DT = 0.01
 GROUND, WALL = HalfSpace(), HalfSpace("wall", (-0.8, 0.0, 0.6), -0.1)
 Solid = HalfSpace | Obstacle
 
@@ -39,6 +42,18 @@ def two_links() -> Articulation:
     free, hinge = Joint("free", JointKind.FREE), Joint("hinge", JointKind.HINGE, (0.6, 0.0, 0.8))
     first = Link("first", joints=(free,), mass=1.0, inertia=eye, com=(0.01, 0.0, 0.02))
     return Articulation.from_links([first, Link("second", "first", (0.3, 0.0, 0.1), joints=(hinge,), mass=0.5, inertia=eye)])
+
+
+def require_touching(scene: Scene, state: Velocities, q: Tensor) -> None:
+    """Something touches in a third of the worlds at least."""
+    assert float((Simulator(scene, DT).eager.objective(state).push(q) > 0).double().mean()) > 0.3
+
+
+def require_alike(scene: Scene, worlds: int, speed: float = 0.3) -> None:
+    """The same forces and derivatives beside all solids."""
+    state, q = beside(scene, worlds, speed=speed)
+    require_touching(scene, state, q)
+    require_balance(scene, state, q)
 
 
 def touching(shapes: Sequence[Shape], solids: Sequence[Solid], kind: Any = Contact, dtype: torch.dtype = torch.float64) -> Scene:
@@ -55,9 +70,9 @@ def touching(shapes: Sequence[Shape], solids: Sequence[Solid], kind: Any = Conta
     return Scene(a, tuple(terms), torch.tensor([0.3, 0.0, -9.81], dtype=dtype))
 
 
-def beside(scene: Scene, worlds: int, seed: int = 0) -> tuple[Velocities, Tensor]:
+def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tuple[Velocities, Tensor]:
     """Random states, and configurations at which a step of theirs may end, with one candidate at the surface of one solid: up to
-    a centimetre deeper or less."""
+    a centimetre deeper or less. speed: standard deviation [m/s, rad/s]."""
     random = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -77,55 +92,9 @@ def beside(scene: Scene, worlds: int, seed: int = 0) -> tuple[Velocities, Tensor
             i = (every // len(contacts)) % len(contact.link)
             shift = (found.depth[every, i] - depth)[:, None] * found.normal[every, i]
             q[:, :3] += torch.where(mine[:, None], shift, 0.0)
-    v = 0.3 * normal(worlds, a.nv)
+    q[:, :3] += 1e-4 * normal(worlds, 3)  # off the borders between faces
+    v = speed * normal(worlds, a.nv)
     return resting(a, retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v), q
-
-
-def resting(a: Articulation, q: Tensor, v: Tensor) -> Velocities:
-    """A state that has felt nothing yet."""
-    zero, nothing = torch.zeros_like(q[..., 0]), torch.zeros_like(v)
-    return Velocities(**fresh(q), v=v, push=nothing, steady=nothing, lag=nothing, average=v, gained=zero, surplus=zero, peak=zero)
-
-
-def require_balance(scene: Scene, state: Velocities, q: Tensor, exact: float = 1e-9) -> None:
-    """The core's r and J are the reference's, each world's by its own largest entry; and something touches in many worlds."""
-    simulator = Simulator(scene, DT)
-    native = NativeStepper(simulator.eager)
-    residual, jacobian = native._core.balance(state, None, native._terms, q)
-    objective = simulator.eager.objective(state)
-    balance = objective.evaluate(q)
-    for ours, theirs in ((residual, balance.residual), (jacobian.flatten(-2), balance.jacobian.flatten(-2))):
-        gap = (ours - theirs).abs().amax(-1) / theirs.abs().amax(-1)
-        assert float(gap.max()) < exact, (gap.argmax(), gap.max())
-    assert float((objective.push(q) > 0).double().mean()) > 0.3
-
-
-def require_steps(scene: Scene, worlds: int = 12, steps: int = 5) -> None:
-    """Steps end where the reference's do, and a world goes alone as in a batch."""
-    simulator = Simulator(scene, DT)
-    native = NativeStepper(simulator.eager)
-    state, _ = beside(scene, worlds, 5)
-    state = simulator.initial_state(state.q, state.v)
-    direct = same = 0
-    for _ in range(steps):
-        after, solution, _ = native.made(state, None)
-        objective = simulator.eager.objective(state)
-        plain = solution.status == int(Status.SOLVED)
-        error = objective.error(objective.evaluate(after.q), 1e-9)
-        assert bool((error[plain] <= 1e-9).all())
-        reference, eager, _ = simulator.eager.made(state, None)
-        both = plain & (eager.status == int(Status.SOLVED))
-        alike = both & ((after.q - reference.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        for field in ("v", "push", "steady", "lag", "surplus", "hazards"):
-            assert torch.allclose(getattr(after, field)[alike] + 0.0, getattr(reference, field)[alike] + 0.0, 1e-5, 1e-5), field
-        state = reference
-    assert same >= 0.97 * direct > 0
-    whole, _, _ = native.made(state, None)
-    for index in (torch.tensor([3]), torch.tensor([worlds - 1, 0, 3])):
-        part, _, _ = native.made(state.take(Worlds((worlds,), index)), None)
-        assert torch.equal(part.q, whole.q[index])
-        assert torch.equal(part.v, whole.v[index])
 
 
 @pytest.mark.parametrize(
@@ -134,5 +103,113 @@ def require_steps(scene: Scene, worlds: int = 12, steps: int = 5) -> None:
 def test_half_spaces(shapes: Sequence[Shape]) -> None:
     """Contacts with different release and slip speeds too."""
     scene = touching(shapes, (GROUND, WALL))
-    require_balance(scene, *beside(scene, 45))
-    require_steps(scene)
+    require_alike(scene, 45)
+    require_steps(scene, beside(scene, 12, 5)[0])
+
+
+@dataclass(frozen=True)
+class Bubble:
+    """A ball, by samples of its signed distance."""
+
+    def surface(self, dtype: torch.dtype, device: torch.device) -> DistanceGrid:
+        x, y, z = np.meshgrid(*(np.linspace(-0.3, 0.3, 13),) * 3, indexing="ij")
+        return DistanceGrid.through(np.sqrt(x * x + y * y + z * z) - 0.2, (-0.3, -0.3, -0.3), 0.05, dtype, device)
+
+
+TILTED = ((0.1, -0.2, 0.3), (0.8, 0.3, -0.4, 0.2))
+HILLS = HeightField.from_function(lambda x, y: 0.1 * np.sin(5 * x) * np.cos(4 * y), (1.0, 0.8), 0.1)
+CONVEX = {
+    "sphere": Obstacle("ball", Sphere(0.2), *TILTED),
+    "capsule": Obstacle("pill", Capsule(0.1, 0.2), *TILTED),
+    "box": Obstacle("block", Box((0.2, 0.15, 0.1)), *TILTED),
+    "cylinder": Obstacle("drum", Cylinder(0.2, 0.1), *TILTED),
+}
+SOLIDS = CONVEX | {"terrain": Obstacle("terrain", HILLS, *TILTED), "grid": Obstacle("bubble", Bubble(), *TILTED)}
+BALLS, CURVED = (Point(), Sphere(0.05), Sphere(0.02)), (Ellipsoid((0.08, 0.05, 0.03)), Cylinder(0.06, 0.04))
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+def test_balls_on_solids(solid: str) -> None:
+    scene = touching(BALLS, (SOLIDS[solid], GROUND))
+    require_alike(scene, 240)
+    require_steps(scene, beside(scene, 12, 5)[0])
+
+
+@pytest.mark.parametrize("solid", CONVEX)
+def test_fast_balls_do_not_pass_through(solid: str) -> None:
+    """Planes stand for what they would pass."""
+    scene = touching(BALLS, (CONVEX[solid],))
+    state, q = beside(scene, 120, speed=10.0)
+    prepared = Simulator(scene, DT).eager.objective(state).prepared[1]
+    assert 0.2 < float(prepared.surface.passed.double().mean()) < 0.8
+    require_balance(scene, state, q)
+
+
+@pytest.mark.parametrize("shape", CURVED)
+def test_curved_bodies_on_half_spaces(shape: Shape) -> None:
+    scene = touching((shape,), (GROUND, WALL), CurvedContact)
+    require_alike(scene, 120)
+    require_steps(scene, beside(scene, 12, 5)[0])
+
+
+@pytest.mark.parametrize("solid", SOLIDS)
+def test_curved_bodies_on_solids(solid: str) -> None:
+    scene = touching(CURVED, (SOLIDS[solid],), CurvedContact)
+    require_alike(scene, 240)
+
+
+def free_body(shape: Shape, solid: Solid, kind: Any = Contact) -> Scene:
+    """One body at the world's axes, where borders are where they are told to be."""
+    a = Articulation.from_links(
+        [Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.0, inertia=diagonal(0.01, 0.02, 0.03))]
+    )
+    contact = kind.between(a, [Collider("body", "body", shape)], solid, NormalForce(1e5), CoulombFriction(0.7))
+    return Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
+
+
+NEAR = (-1e-6, -1e-9, -1e-13, 0.0, 1e-13, 1e-9, 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "solid", "places"),
+    [
+        # edges and corners of a box, the rim and the end of a cylinder's side, the ends of a capsule, borders between cells
+        (Sphere(0.05), Obstacle("o", Box((0.2, 0.15, 0.1))), [(0.2, 0.15, 0.14), (0.2, 0.0, 0.14), (0.2, 0.15, 0.1)]),
+        (
+            Sphere(0.05),
+            Obstacle("o", Cylinder(0.2, 0.1)),
+            [(0.2, 0.0, 0.14), (0.0, 0.2, 0.14), (0.0, 0.0, 0.14), (-0.24, 0.0, 0.1)],
+        ),
+        (Sphere(0.05), Obstacle("o", Capsule(0.1, 0.2)), [(0.0, 0.14, 0.2), (0.14, 0.0, -0.2), (0.0, 0.0, 0.34)]),
+        (Sphere(0.05), Obstacle("o", HILLS), [(0.1, 0.0, 0.08), (0.0, -0.4, 0.04), (-0.5, 0.4, 0.04), (0.7, 0.6, 0.04)]),
+        (Sphere(0.05), Obstacle("o", Bubble()), [(0.0, 0.0, 0.24), (0.15, 0.1, 0.15)]),
+    ],
+)
+def test_borders(shape: Shape, solid: Obstacle, places: Sequence[tuple[float, float, float]]) -> None:
+    """Forces do not jump there, so that they are the same whichever side rounding takes; nor do they where something ends."""
+    scene = free_body(shape, solid)
+    off = torch.tensor([(x, y, z) for x in NEAR for y in NEAR for z in (0.0, 1e-12, -1e-9)], dtype=torch.float64)
+    at = (torch.tensor(places, dtype=torch.float64)[:, None] + off).flatten(0, 1)
+    q = scene.articulation.rest.expand(len(at), -1).clone()
+    q[:, :3] = at
+    before = q.clone()
+    before[:, 0] += 1e-4
+    state = resting(scene.articulation, before, torch.zeros_like(q[:, 1:]))
+    require_touching(scene, state, q)
+    assert float(gaps(scene, state, q)[0].max()) < 1e-6
+
+
+def test_tips_and_rims() -> None:
+    """A body that stands on its tip, and a cylinder that lies, stands, and tips from one to the other."""
+    turns = torch.tensor([0.0, 1e-12, 1e-9, 1e-4, 0.015, 0.02, 0.05, 0.1, 0.2, 1.570796326, 0.5 * math.pi], dtype=torch.float64)
+    for shape in (Ellipsoid((0.03, 0.05, 0.1)), Cylinder(0.06, 0.04)):
+        scene = free_body(shape, GROUND, CurvedContact)
+        a, contact = scene.articulation, scene.terms[1]
+        assert isinstance(contact, Contact)
+        tilted = torch.zeros(len(turns), 6, dtype=torch.float64)
+        tilted[:, 3] = turns
+        q = retract(a, a.rest.expand(len(turns), -1), tilted)
+        q[:, 2] += contact.depth(place(a, q)).amax(-1) - 1e-3
+        state = resting(a, retract(a, q, torch.full_like(tilted, 1e-4)), torch.zeros_like(tilted))
+        require_touching(scene, state, q)
+        require_balance(scene, state, q)

@@ -29,7 +29,13 @@ BLOCKS = 4  # for each thread: some worlds take longer than others
 
 class _Plan(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("bytes", "dimension", "each", "nodes", "nq", "nv", "nu", "candidates", "planes")),
+        *(
+            (name, ctypes.c_int)
+            for name in (
+                *("bytes", "dimension", "each", "nodes", "nq", "nv", "nu"),
+                *("candidates", "planes", "solids", "samples", "forms", "pushes"),
+            )
+        ),
         ("whole", ctypes.c_void_p),
         ("real", ctypes.c_void_p),
     )

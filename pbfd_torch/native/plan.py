@@ -13,24 +13,27 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.not_compiled import unknown
-from pbfd_torch.native.plan_contact import Candidates
+from pbfd_torch.native.plan_contact import Candidates, on_nodes
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
-from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.terms.joint_limits import HELD, JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
+from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
-TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Contact)
+CONTACTS = (Contact, CurvedContact)
+TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Pushes, *CONTACTS)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, and those of the candidates. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or
+    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or
     `[worlds, n]` where worlds have numbers of their own. dimension: 2 where all moves in a plane."""
 
     sizes: tuple[int, ...]
@@ -49,7 +52,7 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
     act, candidates = known.actuators, known.candidates
     nodes, gravity = _nodes(a), stepper.scene.gravity
-    plane = plane_of(a, [gravity, *candidates.normals])
+    plane = None if known.pushed or not candidates.flat else plane_of(a, [gravity, *candidates.normals])
     if plane is not None:
         nodes, candidates, gravity = plane.nodes(a, nodes), candidates.within(plane), gravity @ plane.basis
     whole += _plain(nodes[0]) + _above(a)
@@ -60,9 +63,9 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         whole += act.coordinate.tolist() + act.dof.tolist()
         ranges = [*act.control_range.unbind(-1), *act.force_range.unbind(-1)]
         driven = [act.gear, act.gain, act.bias, act.stiffness, act.damping, *ranges]
-    whole += candidates.whole()
+    whole += candidates.whole() + known.pushed
     scale = force_scale(a, 1.0).expand(t.nv)
-    speeds = [known.limit_release, known.dry_speed]
+    speeds = [known.limit_release, known.limit_per_force, known.dry_speed]
     real = [
         *nodes,
         *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), known.share, known.spring, known.damping, known.armature),
@@ -70,9 +73,10 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         *driven,
         *(gravity, reach(a), a.rest.new_tensor(speeds)),
         *candidates.real(),
+        *(x[k] for k in range(2) for x in known.pushes),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes)
+    sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes, len(known.pushed))
     return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2)
 
 
@@ -140,8 +144,11 @@ class _Terms:
         self.share = zero + 0.5
         self.spring = self.damping = self.armature = self.dry = self.limit = zero
         self.rest = a.rest
-        self.limit_release, self.dry_speed = 1.0, 1e-3
+        self.limit_release, self.limit_per_force, self.dry_speed = 1.0, 0.0, 1e-3
         self.actuators: Actuators | None = None
+        self.drives: Actuators | None = None  # what presses on the limits
+        self.pushed: list[int] = []  # nodes
+        self.pushes: list[tuple[Tensor, Tensor]] = []  # points and forces
         self.candidates = Candidates()
         seen: set[type] = set()
         for term in stepper.terms:
@@ -151,12 +158,17 @@ class _Terms:
             kind = type(inner)
             if kind not in TERMS:
                 raise unknown(kind.__name__)
-            if kind in seen and kind is not Contact:
+            if kind in seen and kind not in (*CONTACTS, Pushes):
                 raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
             self._take(a, inner)
         if any(x.ndim != 1 for x in (self.share, self.spring, self.damping, self.armature, self.dry, self.limit, self.rest)):
             raise unknown("parameters of joints of their own for each world")
+        self._require_own_drives()
+
+    def _require_own_drives(self) -> None:
+        if self.drives is not None and not _alike(self.drives, self.actuators):
+            raise unknown("limits that other actuators press on than the scene's own")
 
     def _take(self, a: Articulation, term: Any) -> None:
         match term:
@@ -169,12 +181,30 @@ class _Terms:
             case JointDryFriction():
                 self.dry, self.dry_speed = term.torque, term.slip_speed
             case JointLimits():
-                if term.drives is not None:
-                    raise unknown("limits that actuators without a largest force press on")
                 self.limit, self.limit_release = term.share * term.stiffness, term.release
+                if term.drives is not None:
+                    self.limit_per_force, self.drives = term.share / HELD**2, term.drives
             case Actuators():
                 if term.gear.ndim != 1:
                     raise unknown("actuators of their own for each world")
                 self.actuators = term
             case Contact():
                 self.candidates.take(a, term)
+            case Pushes():
+                self._push(a, term)
+
+    def _push(self, a: Articulation, term: Pushes) -> None:
+        if term.force.ndim != 2 or term.point.ndim != 2:
+            raise unknown("pushes of their own for each world")
+        links = torch.tensor(a.topology.link_node, device=a.device)
+        some = ((links > 0) & (term.force != 0).any(-1)).nonzero().squeeze(-1)  # what rides on the world does not move
+        self.pushed += (links[some] - 1).tolist()
+        self.pushes.append((on_nodes(a, some, term.point[some]), term.force[some]))
+
+
+def _alike(one: Actuators, other: Actuators | None) -> bool:
+    """Whether two terms press with the same forces."""
+    if other is None:
+        return False
+    names = ("dof", "gear", "gain", "bias", "stiffness", "control_range", "force_range")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)

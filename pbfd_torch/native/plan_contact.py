@@ -9,17 +9,26 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.surface import Plane, Surface
-from pbfd_torch.native.not_compiled import unknown
+from pbfd_torch.contact.distance_grid import DistanceGrid
+from pbfd_torch.contact.height_field import HeightSurface
+from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSurface, SphereSurface
+from pbfd_torch.contact.surface import Plane
+from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What touches what, as `each_kind` in src/kinds.h has it: candidates are sorted by these.
-POINT, BALL = range(2)
-KINDS = ((Plane, POINT), (Plane, BALL))
+SOLIDS = (SphereSurface, SegmentSurface, BoxSurface, CylinderSurface, HeightSurface, DistanceGrid)
+POINT, BALL, ELLIPSOID = range(3)
+KINDS = (
+    *((Plane, support) for support in (POINT, BALL, ELLIPSOID)),
+    *((solid, support) for support in (BALL, ELLIPSOID) for solid in SOLIDS),
+)
+PLANAR = 2  # of them, the first: what the core knows in a plane
 
 
 def link_frames(a: Articulation, link: Tensor) -> Tensor:
@@ -27,42 +36,63 @@ def link_frames(a: Articulation, link: Tensor) -> Tensor:
     return a.link_frame[link]
 
 
+def on_nodes(a: Articulation, link: Tensor, points: Tensor) -> Tensor:
+    """Points of links `[n, 3]` as they are on the nodes, `[n, 3]` [m]."""
+    frame = link_frames(a, link)
+    return (frame[:, :3, :3] @ points[..., None]).squeeze(-1) + frame[:, :3, 3]
+
+
 @dataclass
 class Candidates:
-    """Of all contact terms. nodes, solids: of each candidate of each kind; rows: numbers of each contact, `[n, …]` each."""
+    """Of all contact terms.
 
-    nodes: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
-    solids: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
+    Attributes:
+        indices: node, solid and form of each candidate of each kind.
+        rows: the numbers of some candidates of each kind, `[n, …]` each.
+        planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
+            thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
+    """
+
+    indices: list[list[tuple[int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
-    planes: list[Tensor] = field(default_factory=list)  # [4]
+    planes: list[Tensor] = field(default_factory=list)
+    grids: list[int] = field(default_factory=list)
+    solids: list[Sequence[Tensor]] = field(default_factory=list)
+    samples: list[Tensor] = field(default_factory=list)
+    forms: list[Sequence[Tensor]] = field(default_factory=list)
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of src/candidates.h: candidates, planes."""
-        return sum(map(len, self.nodes)), len(self.planes)
+        """Of src/candidates.h: candidates, planes, solids, samples, forms."""
+        forms = sum(len(form) for form, _, _ in self.forms)
+        return sum(map(len, self.indices)), len(self.planes), len(self.solids), sum(map(len, self.samples)), forms
 
     @property
     def normals(self) -> list[Tensor]:
         """Of all half-spaces."""
         return [x[:3] for x in self.planes]
 
+    @property
+    def flat(self) -> bool:
+        """Whether they are points and balls beside half-spaces only."""
+        return not any(self.indices[PLANAR:])
+
     def within(self, plane: MotionPlane) -> Candidates:
-        """The same in a plane."""
+        """The same in a plane, where they are `flat`."""
         rows: list[list[Sequence[Tensor]]] = []
-        for nodes, row in zip(self.nodes, self.rows, strict=True):
-            left = iter(nodes)
-            rows.append([(plane.on_nodes([next(left) for _ in x[0]], x[0]), *x[1:]) for x in row])
+        for indices, row in zip(self.indices, self.rows, strict=True):
+            rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, _, _), x in zip(indices, row, strict=True)])
         planes = [torch.cat((x[:3] @ plane.basis, x[3:])) for x in self.planes]
-        return Candidates(self.nodes, self.solids, rows, planes)
+        return Candidates(self.indices[:PLANAR], rows, planes)
 
     def whole(self) -> list[int]:
         """The index tables."""
-        return [*map(len, self.nodes), *chain(*self.nodes), *chain(*self.solids)]
+        return [*map(len, self.indices), *chain(*zip(*chain(*self.indices), strict=True)), *self.grids]
 
     def real(self) -> Sequence[Tensor]:
         """The numbers."""
-        rows = [row for kind in self.rows for row in kind]
-        return [*(torch.cat([x.reshape(-1) for x in column]) for column in zip(*rows, strict=True)), *self.planes]
+        tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, [[x] for x in self.samples], self.forms)
+        return [torch.cat([x.reshape(-1) for x in column]) for table in tables for column in zip(*table, strict=True)]
 
     def take(self, a: Articulation, term: Contact) -> None:
         """Adds the candidates of a contact. Raises `NotCompiledError`."""
@@ -75,20 +105,18 @@ class Candidates:
         if term.restitution is not None:
             raise unknown("restitution")
         if term.position.ndim != 2 or term.radius.ndim != 1 or term.margin.ndim != 1:
-            raise unknown(f"contact with '{name}' of its own for each world")
+            raise _differing(name)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
-        moving = [i for i, node in enumerate(nodes) if node > 0]  # what rides on the world does not move
-        solid = self._solid(term.surface, term, name)
+        moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0], dtype=torch.long)  # others ride on the world
 
         def each(value: float | Tensor | None, other: float) -> Tensor:
             number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
             if number.ndim > 1:
-                raise unknown(f"contact with '{name}' of its own for each world")
+                raise _differing(name)
             return number.expand(len(nodes))
 
-        frame = link_frames(a, term.link)
         numbers = (
-            (frame[:, :3, :3] @ term.position[..., None]).squeeze(-1) + frame[:, :3, 3],
+            on_nodes(a, term.link, term.position),
             term.radius,
             term.margin,
             each(law.stiffness, 0.0) * each(term.firm, 1.0),
@@ -97,18 +125,90 @@ class Candidates:
             each(law.release, 0.0),
             each(None if friction is None else friction.slip_speed, 1.0),
         )
-        for kind, (surface, support) in enumerate(KINDS):
-            some = [i for i in moving if surface is type(term.surface) and support == (BALL if term.radius[i] > 0 else POINT)]
-            self.nodes[kind] += [nodes[i] - 1 for i in some]
-            self.solids[kind] += [solid] * len(some)
-            if some:
-                self.rows[kind].append([x[torch.tensor(some)] for x in numbers])
+        if len(moving) == 0:
+            return
+        solid, first = self._solid(a, term, name), self.sizes[-1]
+        if isinstance(term, CurvedContact):
+            self._add_forms(a, term, name)
+        for i in moving.tolist():
+            if isinstance(term, CurvedContact):
+                support, form = ELLIPSOID, first + i
+            else:
+                flat = isinstance(term.surface, Plane) and not bool(term.radius[i] > 0)
+                support, form = (POINT if flat else BALL), 0
+            kind = KINDS.index((type(term.surface), support))
+            self.indices[kind].append((nodes[i] - 1, solid, form))
+            self.rows[kind].append([x[i, None] for x in numbers])
 
-    def _solid(self, surface: Surface, term: Contact, name: str) -> int:
-        """The number of what is touched."""
-        if type(surface) is not Plane or term.carrier is not None:
-            raise unknown(f"contact with '{name}', which is no half-space at rest")
-        if surface.normal.ndim > 2 or surface.offset.ndim > 1 or len(surface.normal.reshape(-1, 3)) > 1:
-            raise unknown(f"contact with '{name}' of its own for each world")
-        self.planes.append(torch.cat((surface.normal.reshape(3), surface.offset.reshape(1))))
-        return len(self.planes) - 1
+    def _solid(self, a: Articulation, term: Contact, name: str) -> int:
+        """Adds what is touched; its number."""
+        surface, carrier = term.surface, term.carrier
+        frame = torch.eye(4, dtype=a.dtype)
+        if carrier is not None:
+            if carrier.motion.moves or any(carrier.motion.belt):
+                raise unknown(f"contact with '{name}', which moves")
+            if carrier.start.ndim > 2:
+                raise _differing(name)
+            frame = carrier.start
+        if isinstance(surface, Plane) and carrier is None:
+            self.planes.append(torch.cat((_one(surface.normal, 3, name), _one(surface.offset, 1, name))))
+            return len(self.planes) - 1
+        grid, size = [0, 0, 0, 0], torch.zeros(6, dtype=a.dtype)
+        match surface:
+            case SphereSurface():
+                size[:1] = _one(surface.radius, 1, name)
+            case SegmentSurface():
+                start, end = _one(surface.start, 3, name), _one(surface.end, 3, name)
+                size[0], size[1] = _one(surface.radius, 1, name)[0], 0.5 * torch.linalg.vector_norm(end - start)
+                frame = frame @ _along(start, end)
+            case BoxSurface():
+                size[:3] = _one(surface.half_extents, 3, name)
+            case CylinderSurface():
+                size[:2] = torch.cat((_one(surface.radius, 1, name), _one(surface.half_length, 1, name)))
+            case HeightSurface():
+                size[:4] = torch.cat((surface.origin, surface.spacing))
+                grid = self._sampled(surface.coefficients)
+            case DistanceGrid():
+                size[:4] = torch.cat((surface.origin, surface.spacing.reshape(1)))
+                grid = self._sampled(surface.coefficients)
+            case _:
+                raise unknown(f"contact with '{name}', which is a {type(surface).__name__}")
+        self.grids += grid
+        placed = torch.cat((frame[:3, :3].reshape(9), frame[:3, 3]))
+        self.solids.append((placed, size, torch.tensor([term.thickness], dtype=a.dtype)))
+        return len(self.solids) - 1
+
+    def _sampled(self, coefficients: Tensor) -> list[int]:
+        """Adds the samples of a grid: where they begin, and how many there are along each of three axes."""
+        first = sum(map(len, self.samples))
+        self.samples.append(coefficients.reshape(-1))
+        return [first, *coefficients.shape, 1][:4]
+
+    def _add_forms(self, a: Articulation, term: CurvedContact, name: str) -> None:
+        if term.form.ndim != 3 or term.axis.ndim != 2:
+            raise _differing(name)
+        turn = link_frames(a, term.link)[:, :3, :3]
+        axis = (turn @ term.axis[..., None]).squeeze(-1)
+        self.forms.append((turn @ term.form @ turn.mT, axis, term.lying.to(term.form.dtype)))
+
+
+def _differing(name: str) -> NotCompiledError:
+    return unknown(f"contact with '{name}' of its own for each world")
+
+
+def _one(value: Tensor, count: int, name: str) -> Tensor:
+    """The `[count]` numbers that all candidates and worlds share."""
+    if value.numel() != count:
+        raise _differing(name)
+    return value.reshape(count)
+
+
+def _along(start: Tensor, end: Tensor) -> Tensor:
+    """The frame `[4, 4]` in the middle of a segment whose z axis lies along it."""
+    along = end - start
+    if not bool(along.abs().max() > 0):
+        along = torch.tensor([0.0, 0.0, 1.0], dtype=start.dtype)
+    z = along / torch.linalg.vector_norm(along)
+    y = torch.linalg.cross(z, torch.eye(3, dtype=z.dtype)[z.abs().argmin()])
+    y = y / torch.linalg.vector_norm(y)
+    return homogeneous(torch.stack((torch.linalg.cross(y, z), y, z), -1), 0.5 * (start + end))

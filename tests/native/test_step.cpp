@@ -23,7 +23,8 @@ const int whole[] = {-1, FREE, 0, 0, 1,
                      0, 1, 2, 0, 0, 0,
                      0, 1, 2, 3, 0, 0,
                      0, 1, 2, 3, 4, 0,
-                     0, 1, 0, 0};
+                     0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
+                     0, 0, 0};
 
 std::vector<double> numbers() {
   const double inf = std::numeric_limits<double>::infinity(), second = MASS * RADIUS * RADIUS / 5;
@@ -35,7 +36,7 @@ std::vector<double> numbers() {
   for (int what = 0; what < 4; what++) each(0, 0);  // no springs, damping, rotors, dry friction
   each(-inf, -inf), each(inf, inf), each(0, 0);
   n.insert(n.end(), {0, 0, 0, 1, 0, 0, 0});
-  n.insert(n.end(), {0, 0, -G, RADIUS, 1, 1e-3});
+  n.insert(n.end(), {0, 0, -G, RADIUS, 1, 0, 1e-3});
   n.insert(n.end(), {0, 0, 0, RADIUS, 0, MASS * G / 1e-6, 0.5, 0.01, 0.1, 1e-3, 0, 0, 1, 0});
   return n;
 }
@@ -55,7 +56,7 @@ struct Worlds {
 // Worlds `first` … of all, each dropped from its own height and set spinning.
 Worlds dropped(int first, int count) {
   const std::vector<double> real = numbers();
-  const pbfd_plan plan{8, 3, 0, 1, NQ, NV, 0, 1, 1, whole, real.data()};
+  const pbfd_plan plan{8, 3, 0, 1, NQ, NV, 0, 1, 1, 0, 0, 0, 0, whole, real.data()};
   CHECK(pbfd_whole_numbers(&plan) == long(sizeof(whole) / sizeof(int)));
   CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);

@@ -9,6 +9,7 @@
 #include "contact.h"
 #include "inertia.h"
 #include "joints.h"
+#include "pushes.h"
 
 namespace pbfd {
 
@@ -17,7 +18,7 @@ template <class V, class N, int D = 3> struct Balance {
   const Plan<N, D>& plan;
   // what is fixed in a step
   Poses<V> start, target;
-  V *start_axes, *q_start, *q_target, *control;
+  V *start_axes, *q_start, *q_target, *control, *limits;
   V dt, weight, share;  // share = 1: inertia works at the end of the step
   Hold<V, D>* holds;
   V* arms;  // κ Σ m p̃ of all that a node moves
@@ -31,7 +32,7 @@ template <class V, class N, int D = 3> struct Balance {
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 2 + s.nv) * s.nv;
+           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 3 + s.nv) * s.nv;
   }
   template <class X> static X* taken(Arena<V>& arena, int count) {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
@@ -42,7 +43,7 @@ template <class V, class N, int D = 3> struct Balance {
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes);
+    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), limits = arena.take(plan.nv);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
     pushes = taken<Push<V, D>>(arena, plan.nodes);
@@ -65,6 +66,7 @@ template <class V, class N, int D = 3> struct Balance {
     }
     pull_all();
     contacts.look(now), contacts.press(pushes);
+    if constexpr (D == 3) push_from_outside(plan, now, pushes);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
     for (int i = 0; i < plan.nv; i++) residual[i] = slopes[i] = V(0);
@@ -139,7 +141,7 @@ template <class V, class N, int D = 3> struct Balance {
     if (!curved) let_go(target), pull_all();
   }
 
-  JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }
+  JointStep<V> steps() const { return {q_start, q_target, control, limits, dt, weight}; }
 
  private:
   bool heavy(int k) const { return any(plan.mass[k] > N(0)); }

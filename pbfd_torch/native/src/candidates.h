@@ -5,20 +5,25 @@
 
 namespace pbfd {
 
-// How many there are.
+// How many there are: of candidates, and of what several of them share.
 struct CandidateSizes {
-  int candidates, planes;
+  int candidates, planes, solids, samples, forms;
 };
 
 template <class N, int D> struct Candidates {
-  static constexpr int KINDS = 2;  // of pairs, see kinds.h
+  static constexpr int KINDS = D == 3 ? 15 : 2;  // of pairs, see kinds.h
 
   const int* counts;                    // [KINDS] candidates of each kind of pair
-  const int *carrier, *solid;           // node; which plane
+  const int *carrier, *solid, *form;    // node; which plane, or which other solid; which ellipsoid
   const N *position, *radius, *margin;  // [D] on the node, [1], [1]
   const N *firmness, *grip, *deep;      // C⊥, μ, from which depth on it is a hazard
   const N *release, *slip_speed;        // [m/s]
-  const N* plane;                       // [D + 1] normal and offset in the world
+  const N* plane;                       // [D + 1] of a half-space: normal and offset in the world
+  // of another solid: rotation and position in the world [12], its sizes [6], its thickness where it is convex; what is sampled
+  // has its samples from the first number of `grid` [4] on, so many along each axis as the others say
+  const N *frame, *measure, *thickness, *sample;
+  const int* grid;
+  const N *ellipsoid, *axis, *lying;  // M [9] on the node; of a rim [3] its axis, and what part in it this one has (terms/lying.py)
 
   Candidates() = default;
   // Walks on over both arrays of a plan.
@@ -26,14 +31,18 @@ template <class N, int D> struct Candidates {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
     const int n = s.candidates;
-    counts = whole(KINDS), carrier = whole(n), solid = whole(n);
+    counts = whole(KINDS), carrier = whole(n), solid = whole(n), form = whole(n), grid = whole(4 * s.solids);
     position = real(D * n), radius = real(n), margin = real(n);
     firmness = real(n), grip = real(n), deep = real(n), release = real(n), slip_speed = real(n);
     plane = real((D + 1) * s.planes);
+    frame = real(12 * s.solids), measure = real(6 * s.solids), thickness = real(s.solids), sample = real(s.samples);
+    ellipsoid = real(9 * s.forms), axis = real(3 * s.forms), lying = real(s.forms);
   }
 
-  static int whole_numbers(CandidateSizes s) { return KINDS + 2 * s.candidates; }
-  static int real_numbers(CandidateSizes s) { return (7 + D) * s.candidates + (D + 1) * s.planes; }
+  static int whole_numbers(CandidateSizes s) { return KINDS + 3 * s.candidates + 4 * s.solids; }
+  static int real_numbers(CandidateSizes s) {
+    return (7 + D) * s.candidates + (D + 1) * s.planes + 19 * s.solids + s.samples + 13 * s.forms;
+  }
 };
 
 }  // namespace pbfd

@@ -14,21 +14,40 @@ template <class V, class N, int D> struct Contacts {
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
   V dt;
+  V* share;  // of its normal force that a candidate gives
+  V* guard;  // [2 + D] 1 where a plane stands for the solid, else 0, and its normal and offset
   // of the nodes at a configuration: the rotation since the start and how it answers a turn, where asked for
   Poses<V> now;
   V *turned_by, *rollings;  // [T], [T × T]
   bool* turned;
 
   static int room(Sizes s) {
-    return T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
   Contacts(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
+    share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
   }
 
-  // The step begins at these poses.
-  void begin(Poses<V> start, V step) { before = start, dt = step; }
+  // The step begins at these poses, and would lead to `free` without contacts.
+  void begin(Poses<V> start, Poses<V> free, V step) {
+    before = start, dt = step;
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      using Surface = typename decltype(pair)::Surface;
+      using Support = typename decltype(pair)::Support;
+      if (!Surface::convex && !Support::wanders) return;
+      for (int i = first; i < last; i++) {
+        V c[D];
+        Beside<V, D> solid;
+        center(i, before, c);
+        Surface::beside(candidates, i, c, solid);
+        if constexpr (Support::wanders)
+          share[i] = Support::share(candidates, i, before.rotation + D * D * candidates.carrier[i], solid.normal);
+        if constexpr (Surface::convex) keep_outside(i, c, solid, free);
+      }
+    });
+  }
 
   // The nodes are at these poses.
   void look(Poses<V> poses) {
@@ -76,6 +95,12 @@ template <class V, class N, int D> struct Contacts {
 
   template <class Pair> V depth(Pair, int i, Poses<V> at, const V* c, Beside<V, D>& solid) const {
     Pair::Surface::beside(candidates, i, c, solid);
+    if constexpr (Pair::Surface::convex) {
+      const V* plane = guard + (2 + D) * i;
+      const M stands = plane[0] > V(0);
+      solid.distance = select(stands, dot<D>(plane + 1, c) - plane[1 + D], solid.distance);
+      for (int j = 0; j < D; j++) solid.normal[j] = select(stands, plane[1 + j], solid.normal[j]);
+    }
     const V reach = Pair::Support::reach(candidates, i, at.rotation + D * D * candidates.carrier[i], solid.normal);
     return reach + V(candidates.margin[i]) - solid.distance;
   }
@@ -89,9 +114,12 @@ template <class V, class N, int D> struct Contacts {
     t.start = depth(Pair(), i, before, c, solid);
     for (int j = 0; j < D; j++) t.moved[j] = t.center[j] - c[j];
     Pair::Surface::bend(candidates, i, t.center, t.solid, t.bend);
+    if constexpr (Pair::Surface::convex)
+      for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
     t.firmness = V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
     t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
+    if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
     V *turn = turned_by + T * k, *rolling = rollings + T * T * k;
     t.turn = turn, t.rolling = rolling;
@@ -99,6 +127,18 @@ template <class V, class N, int D> struct Contacts {
     rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turn);
     log_jacobian<D>(turn, V(-0.5), rolling);
     turned[k] = true;
+  }
+
+ private:
+  // A point that moves far in one step ends beyond the solid, where its distance knows nothing of what lies between: a plane that
+  // touches it where the point is nearest stands for it (contact/surface.py, `Tangent`).
+  void keep_outside(int i, const V* c, const Beside<V, D>& solid, Poses<V> free) {
+    V end[D], *plane = guard + (2 + D) * i;
+    center(i, free, end);
+    for (int j = 0; j < D; j++) end[j] = end[j] - c[j], plane[1 + j] = solid.normal[j];
+    const V thickness = V(candidates.thickness[candidates.solid[i]]);
+    const M led = (solid.distance > V(0)) & (sqrt(dot<D>(end, end)) > fma(V(0.25), thickness, solid.distance));
+    plane[0] = select(led, V(1), V(0)), plane[1 + D] = dot<D>(solid.normal, c) - solid.distance;
   }
 };
 

@@ -52,8 +52,9 @@ template <class V, class N, int D> inline void begin_energy_momentum(Balance<V, 
   b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5);
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
+  stiffen_limits(b.plan, b.steps(), b.limits);
   b.begin();
-  b.contacts.begin(b.start, b.dt);
+  b.contacts.begin(b.start, b.target, b.dt);
 }
 
 }  // namespace pbfd

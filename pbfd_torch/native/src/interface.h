@@ -15,7 +15,7 @@ PBFD_FUNCTION const char* pbfd_target();
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too; `each`: every world has its own numbers,
 // [worlds, count].
 struct pbfd_plan {
-  int bytes, dimension, each, nodes, nq, nv, nu, candidates, planes;
+  int bytes, dimension, each, nodes, nq, nv, nu, candidates, planes, solids, samples, forms, pushes;
   const int* whole;
   const void* real;
 };

@@ -11,8 +11,20 @@ template <class V> struct JointStep {
   const V* start;   // [nq] θ_n
   const V* target;  // [nq] where inertia pulls the rotors
   const V* control;  // [nu]
+  const V* limits;   // [nv] how stiff they are
   V dt, weight;  // [s], κ
 };
+
+// How stiff the limits are in a step: at least so that they hold what its actuators press with where it begins.
+template <class V, class N, int D> inline void stiffen_limits(const Plan<N, D>& plan, const JointStep<V>& step, V* out) {
+  for (int i = 0; i < plan.nv; i++) out[i] = V(0);
+  for (int a = 0; a < plan.nu; a++) {
+    const V gear = V(plan.gear[a]), asked = clamped(step.control[a], V(plan.least_control[a]), V(plan.most_control[a]));
+    const V drive = fma(V(plan.gain[a]), asked, V(plan.bias[a])) - V(plan.stiffness[a]) * gear * step.start[plan.actuated_q[a]];
+    out[plan.actuated_v[a]] += gear * clamped(drive, V(plan.least_force[a]), V(plan.most_force[a]));
+  }
+  for (int i = 0; i < plan.nv; i++) out[i] = max(V(plan.limit[i]), V(plan.limit_per_force[0]) * abs(out[i]));
+}
 
 enum Loads { SMOOTH = 1, ROUGH = 2, ROTORS = 4, ALL = 7 };  // springs, damping, actuators; limits, dry friction; armatures
 
@@ -76,7 +88,7 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
       const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
       if ((LOADS & ROUGH) && any((under > zero) | (over > zero))) {
         V push, rises;
-        const V range = V(plan.limit_release[0]) * step.dt, stiffness = V(plan.limit[i]);
+        const V range = V(plan.limit_release[0]) * step.dt, stiffness = step.limits[i];
         releasing(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), range, push, rises);
         r -= push, slope += rises;
         releasing(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), range, push, rises);

@@ -1,7 +1,7 @@
 // The kinds of pairs that touch: in this order candidates are sorted (native/plan_contact.py).
 #pragma once
+#include "grids.h"
 #include "supports.h"
-#include "surfaces.h"
 
 namespace pbfd {
 
@@ -10,15 +10,28 @@ template <class A, class B> struct Pair {
   using Support = B;
 };
 
+// A function of its own, which the compiler takes by itself: many in one would be too large for it to be made well.
+template <class F, class P> [[gnu::noinline]] void apart(F& visit, P pair, int first, int last) { visit(pair, first, last); }
+
 // Visits each kind with the run of its candidates, `first` … `last` − 1: a loop of its own, without choices in it.
 template <class N, int D, class F> inline void each_kind(const Candidates<N, D>& c, F&& visit) {
   int kind = 0, first = 0;
   auto next = [&](auto pair) {
     const int last = first + c.counts[kind++];
-    if (first < last) visit(pair, first, last);
+    if (first < last) apart(visit, pair, first, last);
     first = last;
   };
   next(Pair<Plane, Point>()), next(Pair<Plane, Ball>());
+  if constexpr (D == 3) {
+    next(Pair<Plane, Ellipsoid>());
+    auto beside_others = [&](auto support) {  // a point there is a ball without a radius
+      using Support = decltype(support);
+      next(Pair<Placed<Globe>, Support>()), next(Pair<Placed<Pill>, Support>());
+      next(Pair<Placed<Block>, Support>()), next(Pair<Placed<Drum>, Support>());
+      next(Pair<Placed<Terrain>, Support>()), next(Pair<Placed<Sampled>, Support>());
+    };
+    beside_others(Ball()), beside_others(Ellipsoid());
+  }
 }
 
 }  // namespace pbfd

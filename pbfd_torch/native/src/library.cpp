@@ -16,7 +16,7 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  return {{p->candidates, p->planes}, p->nodes, p->nq, p->nv, p->nu};
+  return {{p->candidates, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->pushes};
 }
 
 template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {

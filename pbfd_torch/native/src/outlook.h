@@ -52,7 +52,7 @@ template <class V, class N, int D = 3> struct Outlook {
         const V past = sign * (q[c] - bound), speed = sign * d[i];
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
-        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
+        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), b.limits[i]};
       }
     }
     V known;
@@ -83,12 +83,29 @@ template <class V, class N, int D = 3> struct Outlook {
     swing<D>(t, c, v), swing<D>(e, c, a);
     for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
     add_swing<D>(t, v, a);
-    V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
-    if (!any((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) return;
-    contacts.touch(pair, i, at);
+    if constexpr (!Surface::flat || Support::wanders) {
+      contacts.touch(pair, i, at);
+      add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
+    }
+    if constexpr (Support::wanders) {
+      const V bulge = Support::bulge(contacts.candidates, i, contacts.now.rotation + D * D * k, n, at.arm, t);
+      for (int j = 0; j < D; j++) a[j] = fma(-bulge, n[j], a[j]);
+    }
+    const V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
+    V deepens = faster;
+    if constexpr (!Surface::flat) {
+      V tilt[D];
+      times<D>(at.bend, v, tilt);
+      deepens -= dot<D>(tilt, v);
+    }
+    const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
+    if (!any((at.depth + grows > zero) & where)) return;
+    if constexpr (Surface::flat && !Support::wanders) {
+      contacts.touch(pair, i, at);
+      if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
+    }
     Coming<V>& out = coming[count++];
-    if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
-    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = faster, out.steepness = at.solid.steepness;
+    out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
     V u[D], first[D], second[D];
     at.template travel<Surface, Support>(u);

@@ -14,7 +14,7 @@ inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; 
 inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0; }  // of these, the first
 
 struct Sizes : CandidateSizes {
-  int nodes, nq, nv, nu;
+  int nodes, nq, nv, nu, pushes;
 };
 
 template <class N, int D = 3> struct Plan : Sizes {
@@ -37,10 +37,13 @@ template <class N, int D = 3> struct Plan : Sizes {
   const int *actuated_q, *actuated_v;
   const N *gear, *gain, *bias, *stiffness, *resistance, *least_control, *most_control, *least_force, *most_force;
   Candidates<N, D> contact;
+  // forces from outside
+  const int* pushed;           // node
+  const N *push_point, *push;  // [3] on the node, [3] in the world
   // the scene
   const N *gravity;  // [D]
   const N *reach;    // [m]
-  const N *limit_release, *dry_speed;
+  const N *limit_release, *limit_per_force, *dry_speed;
 
   Plan() = default;
   Plan(Sizes sizes, const int* ints, const N* numbers) : Sizes(sizes) {
@@ -56,13 +59,14 @@ template <class N, int D = 3> struct Plan : Sizes {
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
-    gravity = real(D), reach = real(1), limit_release = real(1), dry_speed = real(1);
+    gravity = real(D), reach = real(1), limit_release = real(1), limit_per_force = real(1), dry_speed = real(1);
     contact = Candidates<N, D>(*this, ints, numbers);
+    pushed = whole(pushes), push_point = real(3 * pushes), push = real(3 * pushes);
   }
 
-  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + Candidates<N, D>::whole_numbers(s); }
+  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.pushes + Candidates<N, D>::whole_numbers(s); }
   static int real_numbers(Sizes s) {
-    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + D + 3 + Candidates<N, D>::real_numbers(s);
+    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes + Candidates<N, D>::real_numbers(s);
   }
 };
 

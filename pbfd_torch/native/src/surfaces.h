@@ -1,7 +1,7 @@
 // Solids at rest, as contact sees them: how far a point of the world is from them, which way, and how that way turns
 // (contact/surface.py). Each has
 //   beside: the distance and the direction at a point;   bend: how the direction turns there, ∂n/∂p [D × D], unless it is `flat`.
-// `exact`: φ is the distance itself.
+// `exact`: φ is the distance itself. `convex`: it has an end, and what moves fast might pass through it.
 #pragma once
 #include "candidates.h"
 
@@ -14,7 +14,7 @@ template <class V, int D> struct Beside {
 
 // A half-space.
 struct Plane {
-  static constexpr bool flat = true, exact = true;
+  static constexpr bool flat = true, exact = true, convex = false;
 
   template <class V, class N, int D> static void beside(const Candidates<N, D>& c, int i, const V* point, Beside<V, D>& out) {
     const N* plane = c.plane + (D + 1) * c.solid[i];

@@ -1,0 +1,77 @@
+// Uniform cubic B-splines through samples, as contact/splines.py: every lane gathers its own coefficients.
+#pragma once
+#include "candidates.h"
+
+namespace pbfd {
+
+// A place within the cells along one axis: the cell, and the basis and its derivatives there, [4] each.
+template <int ORDER, class V> struct Basis {
+  V cell, w[ORDER + 1][4];
+
+  Basis(V x, V origin, V spacing) {
+    const V place = (x - origin) / spacing, near = rounded(place), one(1);
+    cell = select(near > place, near - one, near);
+    const V t = place - cell, s = one - t, sixth(1.0 / 6);
+    w[0][0] = s * s * s * sixth, w[0][1] = (V(4) - V(3) * t * t * (V(2) - t)) * sixth;
+    w[0][2] = (V(4) - V(3) * s * s * (V(2) - s)) * sixth, w[0][3] = t * t * t * sixth;
+    V per = one / spacing;
+    w[1][0] = V(-0.5) * s * s * per, w[1][1] = t * fma(V(1.5), t, V(-2)) * per;
+    w[1][2] = -(s * fma(V(1.5), s, V(-2))) * per, w[1][3] = V(0.5) * t * t * per;
+    if constexpr (ORDER >= 2) {
+      per = per / spacing;
+      w[2][0] = s * per, w[2][1] = fma(V(3), t, V(-2)) * per, w[2][2] = fma(V(3), s, V(-2)) * per, w[2][3] = t * per;
+    }
+    if constexpr (ORDER >= 3) {
+      per = per / spacing;
+      w[3][0] = -per, w[3][1] = V(3) * per, w[3][2] = V(-3) * per, w[3][3] = per;
+    }
+  }
+
+  // Which of `size` coefficients count in a lane, [4]: beyond the border the outermost ones repeat.
+  void nodes(int i, int size, int* out) const {
+    const int first = int(lane(clamped(cell, V(-3), V(size)), i));
+    for (int j = 0; j < 4; j++) out[j] = first + j < 0 ? 0 : first + j < size ? first + j : size - 1;
+  }
+  V along(int order, const V* values, int stride) const {
+    const V* x = w[order];
+    return fma(x[0], values[0], fma(x[1], values[stride], fma(x[2], values[2 * stride], x[3] * values[3 * stride])));
+  }
+};
+
+// Partial derivatives of a spline over the plane, D[a][b] = ∂ᵃ₁ ∂ᵇ₂, a + b ≤ ORDER.
+template <int ORDER, class V, class N>
+inline void spline(const N* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, V D[][ORDER + 1]) {
+  V values[16], columns[4];
+  for (int i = 0; i < Kind<V>::lanes; i++) {
+    int rows[4], places[4];
+    x.nodes(i, size[0], rows), y.nodes(i, size[1], places);
+    for (int j = 0; j < 16; j++) put(values[j], i, lane(sample[rows[j / 4] * size[1] + places[j % 4]], i));
+  }
+  for (int a = 0; a <= ORDER; a++) {
+    for (int k = 0; k < 4; k++) columns[k] = x.along(a, values + k, 4);
+    for (int b = 0; a + b <= ORDER; b++) D[a][b] = y.along(b, columns, 1);
+  }
+}
+
+// The same over space, D[a][b][c].
+template <int ORDER, class V, class N>
+inline void spline(
+    const N* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, const Basis<ORDER, V>& z,
+    V D[][ORDER + 1][ORDER + 1]) {
+  V values[64], sheets[16], columns[4];
+  for (int i = 0; i < Kind<V>::lanes; i++) {
+    int rows[4], lines[4], places[4];
+    x.nodes(i, size[0], rows), y.nodes(i, size[1], lines), z.nodes(i, size[2], places);
+    for (int j = 0; j < 64; j++)
+      put(values[j], i, lane(sample[(rows[j / 16] * size[1] + lines[j / 4 % 4]) * size[2] + places[j % 4]], i));
+  }
+  for (int a = 0; a <= ORDER; a++) {
+    for (int k = 0; k < 16; k++) sheets[k] = x.along(a, values + k, 16);
+    for (int b = 0; a + b <= ORDER; b++) {
+      for (int k = 0; k < 4; k++) columns[k] = y.along(b, sheets + k, 4);
+      for (int c = 0; a + b + c <= ORDER; c++) D[a][b][c] = z.along(c, columns, 1);
+    }
+  }
+}
+
+}  // namespace pbfd

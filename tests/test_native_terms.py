@@ -1,0 +1,64 @@
+"""What acts besides contacts in the compiled core: limits that drives press on, pushes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pbfd_torch import Articulation, Joint, JointKind, Link, Scene
+from pbfd_torch.native.library import library
+from pbfd_torch.terms.actuators import Actuator, Actuators
+from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.terms.pushes import Pushes
+from pbfd_torch.tree.kinematics import retract
+from tests.bodies import diagonal
+from tests.native_parity import DT, require_balance, require_steps, resting
+
+pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
+
+
+def arm() -> Articulation:
+    """A free body with a hinge and a slide, both with limits."""
+    inertia = diagonal(0.01, 0.02, 0.015)
+    free, hinge = Joint("free", JointKind.FREE), Joint("hinge", JointKind.HINGE, (0.6, 0.0, 0.8), lower=-0.3, upper=0.3)
+    slide = Joint("slide", JointKind.SLIDE, (0.0, 1.0, 0.0), lower=-0.1, upper=0.2)
+    links = [Link("base", joints=(free,), mass=1.0, com=(0.01, 0.0, 0.02), inertia=inertia)]
+    links.append(Link("upper", "base", (0.3, 0.0, 0.1), joints=(hinge,), mass=0.5, inertia=inertia))
+    links.append(Link("lower", "upper", (0.0, 0.2, 0.0), joints=(slide,), mass=0.4, inertia=inertia))
+    return Articulation.from_links(links)
+
+
+def test_limits_that_drives_press_on() -> None:
+    """Servos without a largest force, two of them on one joint, pressing weakly and strongly."""
+    a = arm()
+    servos = [
+        Actuator.position("turn", "hinge", 200.0, 3.0),
+        Actuator.motor("twist", "hinge", 2.0),
+        Actuator.motor("push", "slide"),
+    ]
+    actuators = Actuators.from_list(a, servos)
+    limits = JointLimits.for_articulation(a, actuators=actuators)
+    assert limits.drives is not None
+    scene = Scene(a, (Inertia(), actuators, limits), torch.tensor([0.3, 0.0, -9.81], dtype=torch.float64))
+    random = torch.Generator().manual_seed(2)
+    worlds = 60
+    v, moved = 0.3 * torch.randn(2, worlds, a.nv, dtype=torch.float64, generator=random)
+    moved[:, -2:] = torch.where(torch.arange(worlds) % 2 > 0, 1.0, -1.0)[:, None] * torch.tensor([0.3, 0.15]) + 2e-3 * v[:, -2:]
+    control = 100 * torch.rand(worlds, 3, dtype=torch.float64, generator=random) ** 4
+    q = retract(a, a.rest.expand(worlds, -1), moved)
+    require_balance(scene, resting(a, retract(a, q, -DT * v), v), q, control)
+    require_steps(scene, resting(a, q[:12], 0.1 * v[:12]), control[:12])
+
+
+def test_pushes() -> None:
+    """On links of a tree, and none on the others."""
+    a = arm()
+    random = torch.Generator().manual_seed(3)
+    force, point = torch.randn(2, 3, 3, dtype=torch.float64, generator=random)
+    force[1] = 0.0
+    scene = Scene(a, (Inertia(), Pushes(5 * force, 0.1 * point), Pushes.at_centers(a, force)), torch.zeros(3, dtype=torch.float64))
+    v, moved = 0.3 * torch.randn(2, 20, a.nv, dtype=torch.float64, generator=random)
+    q = retract(a, a.rest.expand(20, -1), moved)
+    require_balance(scene, resting(a, retract(a, q, -DT * v), v), q)
+    require_steps(scene, resting(a, q, v))
