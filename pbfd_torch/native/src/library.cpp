@@ -63,7 +63,9 @@ template <class T, int D> void energy_momentum_of(const pbfd_plan* p, const pbfd
 
 }  // namespace
 
-long pbfd_whole_numbers(const pbfd_plan* p) { return Plan<double>::whole_numbers(sizes(p)); }
+long pbfd_whole_numbers(const pbfd_plan* p) {
+  return p->dimension == 3 ? Plan<double>::whole_numbers(sizes(p)) : Plan<double, 2>::whole_numbers(sizes(p));
+}
 
 long pbfd_real_numbers(const pbfd_plan* p) {
   return p->dimension == 3 ? Plan<double>::real_numbers(sizes(p)) : Plan<double, 2>::real_numbers(sizes(p));
