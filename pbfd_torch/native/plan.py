@@ -132,8 +132,7 @@ class _Terms:
             self._take(a, inner)
         if any(x.ndim != 1 for x in (self.share, self.spring, self.damping, self.armature, self.dry, self.limit, self.rest)):
             raise unknown("parameters of joints of their own for each world")
-        if self.drives is not None and not _alike(self.drives, self.actuators):
-            raise unknown("limits that other actuators press on than the scene's own")
+        self._require_own_drives()
 
     def _take(self, a: Articulation, term: Any) -> None:
         match term:
@@ -157,6 +156,10 @@ class _Terms:
                 self.candidates.take(a, term)
             case Pushes():
                 self._push(a, term)
+
+    def _require_own_drives(self) -> None:
+        if self.drives is not None and not _alike(self.drives, self.actuators):
+            raise unknown("limits that other actuators press on than the scene's own")
 
     def _push(self, a: Articulation, term: Pushes) -> None:
         if term.force.ndim != 2 or term.point.ndim != 2:

@@ -65,7 +65,7 @@ template <class V, class N> struct Contacts {
         t.depth = depth(pair, i, now, t.center, t.solid);
         if (!any(t.depth > V(0))) continue;
         touch(pair, i, t);
-        pbfd::press<Surface, Support>(t, pushes[candidates.carrier[i]]);
+        pbfd::press<Surface::flat, Support>(t, pushes[candidates.carrier[i]]);
       }
     });
   }
@@ -119,14 +119,17 @@ template <class V, class N> struct Contacts {
     t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
+    if (!turned[k]) turn(k);
     t.turn = turns + 3 * k, t.rolling = rollings + 9 * k;
-    if (turned[k]) return;
+  }
+
+ private:
+  [[gnu::noinline]] void turn(int k) {
     rotation_between(now.rotation + 9 * k, before.rotation + 9 * k, turns + 3 * k);
     log_jacobian(turns + 3 * k, V(-0.5), rollings + 9 * k);
     turned[k] = true;
   }
 
- private:
   // A point that moves far in one step ends beyond the solid, where its distance knows nothing of what lies between: a plane that
   // touches it where the point is nearest stands for it (contact/surface.py, `Tangent`).
   void keep_outside(int i, const V* c, const Beside<V>& solid, Poses<V> free) {

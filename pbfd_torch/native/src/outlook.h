@@ -72,6 +72,7 @@ template <class V, class N> struct Outlook {
   template <class Pair> void foresee(Contacts<V, N>& contacts, Pair pair, int i, typename Kind<V>::Mask where) {
     using Surface = typename Pair::Surface;
     using Support = typename Pair::Support;
+    constexpr bool simple = Surface::flat && !Support::wanders;  // its depth knows nothing of the body's rotation
     const int k = contacts.candidates.carrier[i];
     const V zero(0), *t = twist + 6 * k, *e = drift + 6 * k;
     Touching<V> at;
@@ -84,7 +85,7 @@ template <class V, class N> struct Outlook {
     cross(e, c, a);
     for (int j = 0; j < 3; j++) a[j] += e[3 + j];
     add_cross(t, v, a);
-    if constexpr (!Surface::flat || Support::wanders) {
+    if constexpr (!simple) {
       contacts.touch(pair, i, at);
       add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
     }
@@ -101,19 +102,25 @@ template <class V, class N> struct Outlook {
     }
     const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
     if (!any((at.depth + grows > zero) & where)) return;
-    if constexpr (Surface::flat && !Support::wanders) {
+    if constexpr (simple) {
       contacts.touch(pair, i, at);
       if constexpr (Support::rolls) add_cross(t, at.arm.s, v), add_cross(e, at.arm.s, a);
     }
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
-    V u[3], first[3], second[3];
-    at.template travel<Surface, Support>(u);
+    V u[3];
+    at.template travel<Support>(u);
+    slide(out, u, n, v, a, faster);
+  }
+
+  // How the square of the slip grows that is now what u [3] has along the plane, of a surface that moves like this.
+  [[gnu::noinline]] static void slide(Coming<V>& out, V* u, const V* n, const V* v, const V* a, V faster) {
+    V first[3], second[3];
     const V lifted = dot(u, n);
     for (int j = 0; j < 3; j++) {
       u[j] = fma(-lifted, n[j], u[j]);
-      first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
+      first[j] = fma(out.sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
     }
     out.size = dot(u, u), out.along = dot(u, first);
     out.square = dot(first, first) + dot(u, second), out.cube = dot(first, second), out.fourth = dot(second, second);

@@ -22,16 +22,17 @@ template <class V> struct Touching {
   const V *turn, *rolling;  // ϕ [3], and how it answers ω [9]; null where nothing rolls
 
   // m [3]
-  template <class Surface, class Support> void travel(V* out) const {
+  template <class Support> void travel(V* out) const {
     for (int j = 0; j < 3; j++) out[j] = moved[j];
     if constexpr (Support::rolls) add_cross(turn, arm.s, out);
   }
 };
 
-template <class Surface, class Support, class V> inline void press(const Touching<V>& t, Push<V>& out) {
+// `FLAT`: the normal does not turn, and the depth is the distance itself.
+template <bool FLAT, class Support, class V> [[gnu::noinline]] void press(const Touching<V>& t, Push<V>& out) {
   const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
   V m[3], u[3], p[3], f[3];
-  t.template travel<Surface, Support>(m);
+  t.template travel<Support>(m);
   const V lifted = dot(m, n);
   for (int j = 0; j < 3; j++) u[j] = fma(-lifted, n[j], m[j]), p[j] = Support::rolls ? c[j] + s[j] : c[j];
   V push, rises, factor, falls;
@@ -54,13 +55,13 @@ template <class Surface, class Support, class V> inline void press(const Touchin
   };
   for (int b = 0; b < 3; b++) {  // w
     V slips[3], a[3], sinks = n[b];
-    if constexpr (!Surface::exact) sinks = t.solid.steepness * sinks;
-    if constexpr (Surface::flat) {
+    if constexpr (FLAT) {
       for (int j = 0; j < 3; j++) slips[j] = fma(-n[b], n[j], V(j == b));
       answer(slips, sinks, a);
       wrench(b, a, nullptr, by_shift);
     } else {
       V tilt[3], shifted[3], move[3];
+      sinks = t.solid.steepness * sinks;
       for (int j = 0; j < 3; j++) tilt[j] = t.bend[3 * j + b], shifted[j] = t.arm.by_shift[3 * j + b], move[j] = V(j == b);
       add_cross(t.turn, shifted, move);
       if constexpr (Support::wanders) sinks = sinks - t.arm.reach_by_shift[b];
