@@ -21,7 +21,7 @@ from pbfd_torch.tensors.worlds import Worlds
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
-COVERED = ("chain-fixed", "chain-ground", "chain-slope", "dzhanibekov", "hopper", "walker")
+COVERED = ("box-slide", "chain-fixed", "chain-ground", "chain-slope", "dzhanibekov", "hopper", "walker")
 FIELDS = ("q", "v", "push", "steady", "lag", "average", "gained", "surplus", "peak", "time", "hazards")
 
 
@@ -122,7 +122,7 @@ def test_batches_of_any_shape() -> None:
     ("name", "changes", "words"),
     [
         ("stack", {}, "BodyContact"),
-        ("mesh-terrain", {}, "no half-space at rest"),
+        ("arch", {}, "AnchoredFriction"),
         ("hopper", {"integrator": ImplicitEuler()}, "ImplicitEuler"),
     ],
 )

@@ -37,6 +37,7 @@ class _Step(ctypes.Structure):
         ("given", ctypes.c_void_p * 10),
         ("found", ctypes.c_void_p * 10),
         ("counted", ctypes.c_void_p * 5),
+        ("grip", ctypes.c_void_p),
     )
 
 
@@ -121,6 +122,9 @@ class Core:
         step = _Step(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, worlds, 0, worlds)
         for i, x in enumerate(given):
             step.given[i] = x.data_ptr()
+        if self.plan.grip is not None:
+            given.append(_last(self.plan.grip, batch, worlds))
+            step.grip = given[-1].data_ptr()
         return step, given
 
     def _aligned_room(self) -> Tensor:

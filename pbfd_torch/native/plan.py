@@ -31,11 +31,13 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `int32`. real: of the scene's dtype."""
+    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `int32`. real: of the scene's dtype.
+    grip: μ of the candidates `[*batch, candidates]`, where worlds differ."""
 
     sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
+    grip: Tensor | None
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -67,7 +69,8 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         *(x[k] for k in range(2) for x in known.pushes),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    return Plan((t.njoint, t.nq, t.nv, nu, *candidates.sizes, len(known.pushed)), torch.tensor(whole, dtype=torch.int32), flat)
+    sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes, len(known.pushed))
+    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, candidates.grip)
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:

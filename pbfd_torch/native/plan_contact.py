@@ -46,13 +46,14 @@ class Candidates:
 
     Attributes:
         indices: node, solid and form of each candidate of each kind.
-        rows: the numbers of some candidates of each kind, `[n, …]` each.
+        rows: the numbers of some candidates of each kind, `[n, …]` each. grips: their μ, `[*batch, n]`.
         planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
             thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
     """
 
     indices: list[list[tuple[int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    grips: list[list[Tensor]] = field(default_factory=lambda: [[] for _ in KINDS])
     planes: list[Tensor] = field(default_factory=list)
     grids: list[int] = field(default_factory=list)
     solids: list[Sequence[Tensor]] = field(default_factory=list)
@@ -73,6 +74,15 @@ class Candidates:
         """The numbers."""
         tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, [[x] for x in self.samples], self.forms)
         return [torch.cat([x.reshape(-1) for x in column]) for table in tables for column in zip(*table, strict=True)]
+
+    @property
+    def grip(self) -> Tensor | None:
+        """μ of all candidates `[*batch, n]`, where worlds differ."""
+        grips = list(chain(*self.grips))
+        if all(x.ndim == 1 for x in grips):
+            return None
+        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in grips))
+        return torch.cat([x.expand(*batch, -1) for x in grips], -1)
 
     def take(self, a: Articulation, term: Contact) -> None:
         """Adds the candidates of a contact. Raises `NotCompiledError`."""
@@ -95,12 +105,15 @@ class Candidates:
                 raise _differing(name)
             return number.expand(len(nodes))
 
+        mu = 0.0 if friction is None else friction.mu
+        grip = torch.as_tensor(mu if term.grip is None else mu * term.grip, dtype=a.dtype)
+        grip = grip.expand(*grip.shape[:-1], len(nodes))
         numbers = (
             on_nodes(a, term.link, term.position),
             term.radius,
             term.margin,
             each(law.stiffness, 0.0) * each(term.firm, 1.0),
-            each(None if friction is None else friction.mu, 0.0) * each(term.grip, 1.0),
+            grip.reshape(-1, len(nodes))[0],  # where worlds differ they bring their own
             each(term.deep, torch.finfo(a.dtype).max),
             each(law.release, 0.0),
             each(None if friction is None else friction.slip_speed, 1.0),
@@ -119,6 +132,7 @@ class Candidates:
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form))
             self.rows[kind].append([x[i, None] for x in numbers])
+            self.grips[kind].append(grip[..., i, None])
 
     def _solid(self, a: Articulation, term: Contact, name: str) -> int:
         """Adds what is touched; its number."""

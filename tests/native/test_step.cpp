@@ -56,7 +56,7 @@ Worlds dropped(int first, int count) {
     worlds.given[1][4 * count + w] = first + w;
   }
   for (int step = 0; step < STEPS; step++) {
-    pbfd_step s{DT, 1e-9, 1e-3, 40, count, 0, count, {}, {}, {}};
+    pbfd_step s{DT, 1e-9, 1e-3, 40, count, 0, count, {}, {}, {}, nullptr};
     for (int i = 0; i < 10; i++) s.given[i] = worlds.given[i].data(), s.found[i] = worlds.found[i].data();
     for (int i = 0; i < 5; i++) s.counted[i] = worlds.counted[i].data();
     pbfd_energy_momentum(&plan, &s, room);

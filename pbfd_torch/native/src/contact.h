@@ -7,9 +7,13 @@
 namespace pbfd {
 
 template <class V, class N> struct Contacts {
+  using T = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   const Plan<N>& plan;
   const Candidates<N>& candidates;
+  // of the worlds in the lanes
+  const T* own_grip = nullptr;  // [candidates, worlds], where worlds differ
+  V* grip;                      // μ [candidates]
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
   V dt;
@@ -21,12 +25,19 @@ template <class V, class N> struct Contacts {
   bool* turned;
 
   static int room(Sizes s) {
-    return 6 * s.candidates + 12 * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return 7 * s.candidates + 12 * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
   Contacts(const Plan<N>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
-    share = arena.take(plan.candidates), guard = arena.take(5 * plan.candidates);
+    grip = arena.take(plan.candidates), share = arena.take(plan.candidates), guard = arena.take(5 * plan.candidates);
     turns = arena.take(3 * plan.nodes), rollings = arena.take(9 * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
+    for (int i = 0; i < plan.candidates; i++) grip[i] = V(candidates.grip[i]);
+  }
+
+  // A lane takes a world, of so many.
+  void load(int i, int world, int worlds) {
+    if (!own_grip) return;
+    for (int j = 0; j < plan.candidates; j++) put(grip[j], i, own_grip[j * worlds + world]);
   }
 
   // The step begins at these poses, and would lead to `free` without contacts.
@@ -115,7 +126,7 @@ template <class V, class N> struct Contacts {
     if constexpr (Pair::Surface::convex)
       for (V& x : t.bend) x = select(guard[5 * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + 9 * k, t.solid.normal, t.bend, t.arm);
-    t.firmness = V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
+    t.firmness = V(candidates.firmness[i]), t.grip = grip[i];
     t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;

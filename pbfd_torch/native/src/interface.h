@@ -29,6 +29,7 @@ struct pbfd_step {
   const void* given[10];
   void* found[10];
   int* counted[5];
+  const void* grip;  // μ of the candidates, [candidates, worlds]; null: the plan's
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.

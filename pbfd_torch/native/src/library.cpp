@@ -30,6 +30,7 @@ template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_step* s, 
       given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), given(9),
       found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), found(9),
       s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
+  machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
   machine.scheme.surplus_allowed = V(T(s->surplus));
   machine.run(arrays, s->worlds, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
 }
@@ -41,7 +42,8 @@ void balance_of(const pbfd_plan* p, const pbfd_step* s, const void* q, void* res
   Arena<V> arena{static_cast<V*>(room)};
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   const BalanceArrays<T> arrays{
-      given(0), given(1), given(9), static_cast<const T*>(q), static_cast<T*>(residual), static_cast<T*>(jacobian)};
+      given(0), given(1), given(9), static_cast<const T*>(s->grip),
+      static_cast<const T*>(q), static_cast<T*>(residual), static_cast<T*>(jacobian)};
   inspect(plan, arrays, s->worlds, s->first, s->last, V(T(s->dt)), arena);
 }
 

@@ -107,6 +107,7 @@ template <class V, class N> struct Machine {
     move(a.average, a.average_out, before.average, after.average);
   }
   void load(const StepArrays<T>& a, int worlds, int i, int world) {
+    newton.balance.contacts.load(i, world, worlds);
     for (int j = 0; j < plan.nq; j++) put(q[j], i, a.q[j * worlds + world]);
     each(a, [&](const T* from, T*, V* to, V*) {
       for (int j = 0; j < plan.nv; j++) put(to[j], i, from[j * worlds + world]);
