@@ -63,6 +63,7 @@ def require_steps(scene: Scene, start: Velocities, control: Tensor | None = None
     whole, _, _ = native.made(state, control)
     for index in (torch.tensor([3]), torch.tensor([worlds - 1, 0, 3])):
         held = None if control is None else control[index]
-        part, _, _ = native.made(state.take(Worlds((worlds,), index)), held)
+        some = Worlds((worlds,), index)
+        part, _, _ = native.take(some).made(state.take(some), held)
         assert torch.equal(part.q, whole.q[index])
         assert torch.equal(part.v, whole.v[index])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,16 +17,20 @@ from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.height_field import HeightField
+from pbfd_torch.contact.motion import Conveyor
 from pbfd_torch.contact.obstacle import Obstacle
-from pbfd_torch.contact.shapes import Box, Capsule, Collider, Cylinder, Ellipsoid, Point, Shape, Sphere
+from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.native.library import library
+from pbfd_torch.native.stepper import uncovered
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
+from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
 from tests.native_parity import DT, gaps, require_balance, require_steps, resting
@@ -105,6 +110,38 @@ def test_half_spaces(shapes: Sequence[Shape]) -> None:
     scene = touching(shapes, (GROUND, WALL))
     require_alike(scene, 45)
     require_steps(scene, beside(scene, 12, 5)[0])
+
+
+def test_friction_of_each_world() -> None:
+    """Beside contacts whose friction is one for all."""
+    scene = touching((Sphere(0.05), Point()), (GROUND, WALL))
+    worlds, contact = 60, scene.terms[1]
+    assert isinstance(contact, Contact)
+    mu = torch.linspace(0.1, 1.5, worlds, dtype=torch.float64)[:, None]
+    scene = dataclasses.replace(
+        scene, terms=(scene.terms[0], dataclasses.replace(contact, friction=CoulombFriction(mu)), scene.terms[2])
+    )
+    state, q = beside(scene, worlds)
+    require_balance(scene, state, q)
+    require_steps(
+        scene.take(Worlds((worlds,), torch.arange(12))), beside(scene, worlds)[0].take(Worlds((worlds,), torch.arange(12)))
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "solid", "restitution", "words"),
+    [
+        (NormalForce(1e5, exponent=1.5), GROUND, None, "normal force on 'ground' with another exponent than 2"),
+        (NormalForce(1e5), HalfSpace(motion=Conveyor((1.0, 0.0, 0.0))), None, "contact with 'ground', which moves"),
+        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), None, "contact with 'hull', which is a ConvexSurface"),
+        (NormalForce(1e5), GROUND, Restitution(0.5), "restitution"),
+    ],
+)
+def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, restitution: Restitution | None, words: str) -> None:
+    a = two_links()
+    contact = Contact.between(a, [Collider("c", "second", Sphere(0.1))], solid, law, CoulombFriction(0.7), restitution)
+    scene = Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
+    assert uncovered(Simulator(scene, DT).eager) == f"the core does not know {words}"
 
 
 @dataclass(frozen=True)

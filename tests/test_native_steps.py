@@ -24,7 +24,7 @@ from pbfd_torch.tree.rotations import skew
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
-COVERED = ("chain-fixed", "chain-ground", "chain-slope", "dzhanibekov", "hopper", "walker")
+COVERED = ("box-slide", "chain-fixed", "chain-ground", "chain-slope", "dzhanibekov", "hopper", "walker")
 FIELDS = ("q", "v", "push", "steady", "lag", "average", "gained", "surplus", "peak", "time", "hazards")
 
 
@@ -163,7 +163,7 @@ def test_a_plane_is_space_with_less(name: str, tmp_path: Path, monkeypatch: pyte
     ("name", "changes", "words"),
     [
         ("stack", {}, "BodyContact"),
-        ("mesh-terrain", {}, "no half-space at rest"),
+        ("arch", {}, "AnchoredFriction"),
         ("hopper", {"integrator": ImplicitEuler()}, "ImplicitEuler"),
     ],
 )

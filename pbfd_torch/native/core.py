@@ -32,7 +32,7 @@ class _Plan(ctypes.Structure):
         *(
             (name, ctypes.c_int)
             for name in (
-                *("bytes", "dimension", "each", "nodes", "nq", "nv", "nu"),
+                *("bytes", "dimension", "nodes", "nq", "nv", "nu"),
                 *("candidates", "planes", "solids", "samples", "forms", "pushes"),
             )
         ),
@@ -51,6 +51,7 @@ class _Steps(ctypes.Structure):
         ("found", ctypes.c_void_p * 9),
         ("residual_norm", ctypes.c_void_p),
         ("counted", ctypes.c_void_p * 5),
+        ("grip", ctypes.c_void_p),
     )
 
 
@@ -69,17 +70,18 @@ class Journey:
 
     Attributes:
         given: the fields of the state `[*batch, ...]` that each world goes on from.
-        control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps.
+        control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
         fields: of the state after each step, `[steps, *batch, ...]`.
         residual_norm, counted, fallbacks: how each was solved, `[steps, *batch, ...]`.
         made: `[*batch]`, how many of its steps each world has made; the next one stopped it, and its end is there.
     """
 
-    def __init__(self, state: Velocities, control: Tensor, steps: int) -> None:
+    def __init__(self, state: Velocities, control: Tensor, steps: int, grip: Tensor | None) -> None:
         batch, self.steps = tuple(state.q.shape[:-1]), steps
         self.given = {name: _whole(getattr(state, name), (*batch, getattr(state, name).shape[-1])) for name in VECTORS}
         self.given |= {name: _whole(getattr(state, name), batch) for name in NUMBERS}
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
+        self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
         self.fields = {name: x.new_empty((steps, *x.shape)) for name, x in self.given.items()}
         self.residual_norm = state.q.new_empty((steps, *batch))
         self.counted = {name: torch.empty((steps, *batch), dtype=torch.int32) for name in COUNTED}
@@ -92,6 +94,8 @@ class Journey:
         asked = _Steps(*dataclasses.astuple(terms), self.made.numel(), 0, self.made.numel(), self.steps, held)
         asked.made, asked.control = self.made.data_ptr(), self.control.data_ptr()
         asked.residual_norm = self.residual_norm.data_ptr()
+        if self.grip is not None:
+            asked.grip = self.grip.data_ptr()
         for array, values in ((asked.given, self.given), (asked.found, self.fields), (asked.counted, self.counted)):
             for i, x in enumerate(values.values()):
                 array[i] = x.data_ptr()
@@ -117,11 +121,10 @@ class Core:
     def __init__(self, library: Library, plan: Plan, threads: int) -> None:
         self.plan, self._threads = plan, threads
         self._functions = library.functions
-        each = plan.real.ndim > 1
-        self._plan = _Plan(plan.real.element_size(), plan.dimension, each, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
-        if wanted != (len(plan.whole), plan.real.shape[-1]):
-            raise ValueError(f"the plan has {len(plan.whole)} and {plan.real.shape[-1]} numbers: the core wants {wanted}")
+        if wanted != (len(plan.whole), len(plan.real)):
+            raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")
         self._size = self._asked("pbfd_room") + ALIGNMENT
         self._rooms: list[Tensor] = []  # that no call is in
         self._lanes = library.lanes(plan.real.dtype)
@@ -162,7 +165,7 @@ class Core:
         """The balance of forces of the step from a state at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(state, held, 1)
+        journey = Journey(state, held, 1, self.plan.grip)
         at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         with self._room() as room:

@@ -33,13 +33,14 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype, or
-    `[worlds, n]` where worlds have numbers of their own. dimension: 2 where all moves in a plane."""
+    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
+    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ."""
 
     sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
     dimension: int
+    grip: Tensor | None
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -77,7 +78,7 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
     sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes, len(known.pushed))
-    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2)
+    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2, candidates.grip)
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:
@@ -166,10 +167,6 @@ class _Terms:
             raise unknown("parameters of joints of their own for each world")
         self._require_own_drives()
 
-    def _require_own_drives(self) -> None:
-        if self.drives is not None and not _alike(self.drives, self.actuators):
-            raise unknown("limits that other actuators press on than the scene's own")
-
     def _take(self, a: Articulation, term: Any) -> None:
         match term:
             case JointSprings():
@@ -192,6 +189,10 @@ class _Terms:
                 self.candidates.take(a, term)
             case Pushes():
                 self._push(a, term)
+
+    def _require_own_drives(self) -> None:
+        if self.drives is not None and not _alike(self.drives, self.actuators):
+            raise unknown("limits that other actuators press on than the scene's own")
 
     def _push(self, a: Articulation, term: Pushes) -> None:
         if term.force.ndim != 2 or term.point.ndim != 2:

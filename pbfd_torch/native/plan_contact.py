@@ -48,13 +48,14 @@ class Candidates:
 
     Attributes:
         indices: node, solid and form of each candidate of each kind.
-        rows: the numbers of some candidates of each kind, `[n, …]` each.
+        rows: the numbers of some candidates of each kind, `[n, …]` each. grips: their μ, `[*batch, n]`.
         planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
             thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
     """
 
     indices: list[list[tuple[int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    grips: list[list[Tensor]] = field(default_factory=lambda: [[] for _ in KINDS])
     planes: list[Tensor] = field(default_factory=list)
     grids: list[int] = field(default_factory=list)
     solids: list[Sequence[Tensor]] = field(default_factory=list)
@@ -83,7 +84,7 @@ class Candidates:
         for indices, row in zip(self.indices, self.rows, strict=True):
             rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, _, _), x in zip(indices, row, strict=True)])
         planes = [torch.cat((x[:3] @ plane.basis, x[3:])) for x in self.planes]
-        return Candidates(self.indices[:PLANAR], rows, planes)
+        return Candidates(self.indices[:PLANAR], rows, self.grips, planes)
 
     def whole(self) -> list[int]:
         """The index tables."""
@@ -93,6 +94,15 @@ class Candidates:
         """The numbers."""
         tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, [[x] for x in self.samples], self.forms)
         return [torch.cat([x.reshape(-1) for x in column]) for table in tables for column in zip(*table, strict=True)]
+
+    @property
+    def grip(self) -> Tensor | None:
+        """μ of all candidates `[*batch, n]`, where worlds differ."""
+        grips = list(chain(*self.grips))
+        if all(x.ndim == 1 for x in grips):
+            return None
+        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in grips))
+        return torch.cat([x.expand(*batch, -1) for x in grips], -1)
 
     def take(self, a: Articulation, term: Contact) -> None:
         """Adds the candidates of a contact. Raises `NotCompiledError`."""
@@ -115,12 +125,15 @@ class Candidates:
                 raise _differing(name)
             return number.expand(len(nodes))
 
+        mu = 0.0 if friction is None else friction.mu
+        grip = torch.as_tensor(mu if term.grip is None else mu * term.grip, dtype=a.dtype)
+        grip = grip.expand(*grip.shape[:-1], len(nodes))
         numbers = (
             on_nodes(a, term.link, term.position),
             term.radius,
             term.margin,
             each(law.stiffness, 0.0) * each(term.firm, 1.0),
-            each(None if friction is None else friction.mu, 0.0) * each(term.grip, 1.0),
+            grip.reshape(-1, len(nodes))[0],  # where worlds differ they bring their own
             each(term.deep, torch.finfo(a.dtype).max),
             each(law.release, 0.0),
             each(None if friction is None else friction.slip_speed, 1.0),
@@ -139,6 +152,7 @@ class Candidates:
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form))
             self.rows[kind].append([x[i, None] for x in numbers])
+            self.grips[kind].append(grip[..., i, None])
 
     def _solid(self, a: Articulation, term: Contact, name: str) -> int:
         """Adds what is touched; its number."""

@@ -103,7 +103,7 @@ class NativeStepper:
             controls = state.q.new_zeros(1, self.scene.nu)
         controls = spread(controls, batch)
         with torch.no_grad():
-            journey = Journey(state, controls, steps)
+            journey = Journey(state, controls, steps, self._core.plan.grip)
             self._core.go(journey, self._terms)
             while len(journey.stopped):
                 self._lead_on(journey, state)

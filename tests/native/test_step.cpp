@@ -56,7 +56,7 @@ struct Worlds {
 // Worlds `first` … of all, each dropped from its own height and set spinning.
 Worlds dropped(int first, int count) {
   const std::vector<double> real = numbers();
-  const pbfd_plan plan{8, 3, 0, 1, NQ, NV, 0, 1, 1, 0, 0, 0, 0, whole, real.data()};
+  const pbfd_plan plan{8, 3, 1, NQ, NV, 0, 1, 1, 0, 0, 0, 0, whole, real.data()};
   CHECK(pbfd_whole_numbers(&plan) == long(sizeof(whole) / sizeof(int)));
   CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   void* room = std::aligned_alloc(64, (pbfd_room(&plan) + 127) / 64 * 64);
@@ -65,7 +65,7 @@ Worlds dropped(int first, int count) {
     worlds.given[0][w * NQ + 2] = RADIUS + 0.01 * (first + w), worlds.given[0][w * NQ + 3] = 1;
     worlds.given[1][w * NV + 4] = first + w;
   }
-  pbfd_steps s{DT, 1e-9, 1e-3, 40, count, 0, count, STEPS, 1, worlds.made.data(), {}, nullptr, {}, worlds.residual_norm.data(), {}};
+  pbfd_steps s{DT, 1e-9, 1e-3, 40, count, 0, count, STEPS, 1, worlds.made.data(), {}, nullptr, {}, worlds.residual_norm.data(), {}, nullptr};
   for (int i = 0; i < 9; i++) s.given[i] = worlds.given[i].data(), s.found[i] = worlds.found[i].data();
   for (int i = 0; i < 5; i++) s.counted[i] = worlds.counted[i].data();
   pbfd_energy_momentum(&plan, &s, room);

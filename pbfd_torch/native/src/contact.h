@@ -7,10 +7,13 @@
 namespace pbfd {
 
 template <class V, class N, int D> struct Contacts {
-  static constexpr int T = turns(D);
+  using Scalar = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
+  // of the worlds in the lanes
+  const Scalar* own_grip = nullptr;  // [worlds, candidates], where worlds differ
+  V* grip;                           // μ [candidates]
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
   V dt;
@@ -22,12 +25,19 @@ template <class V, class N, int D> struct Contacts {
   bool* turned;
 
   static int room(Sizes s) {
-    return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return (4 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
   Contacts(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
-    share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
+    grip = arena.take(plan.candidates), share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
+    for (int i = 0; i < plan.candidates; i++) grip[i] = V(candidates.grip[i]);
+  }
+
+  // A lane takes a world.
+  void load(int i, int world) {
+    if (!own_grip) return;
+    for (int j = 0; j < plan.candidates; j++) put(grip[j], i, own_grip[long(world) * plan.candidates + j]);
   }
 
   // The step begins at these poses, and would lead to `free` without contacts.
@@ -66,7 +76,7 @@ template <class V, class N, int D> struct Contacts {
         t.depth = depth(pair, i, now, t.center, t.solid);
         if (!any(t.depth > V(0))) continue;
         touch(pair, i, t);
-        pbfd::press<Surface, Support>(t, pushes[candidates.carrier[i]]);
+        pbfd::press<Surface::flat, Support>(t, pushes[candidates.carrier[i]]);
       }
     });
   }
@@ -117,19 +127,23 @@ template <class V, class N, int D> struct Contacts {
     if constexpr (Pair::Surface::convex)
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
-    t.firmness = V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
+    t.firmness = V(candidates.firmness[i]), t.grip = grip[i];
     t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
-    V *turn = turned_by + T * k, *rolling = rollings + T * T * k;
-    t.turn = turn, t.rolling = rolling;
-    if (turned[k]) return;
-    rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turn);
-    log_jacobian<D>(turn, V(-0.5), rolling);
-    turned[k] = true;
+    if (!turned[k]) turn(k);
+    t.turn = turned_by + T * k, t.rolling = rollings + T * T * k;
   }
 
  private:
+  static constexpr int T = turns(D);
+
+  [[gnu::noinline]] void turn(int k) {
+    rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turned_by + T * k);
+    log_jacobian<D>(turned_by + T * k, V(-0.5), rollings + T * T * k);
+    turned[k] = true;
+  }
+
   // A point that moves far in one step ends beyond the solid, where its distance knows nothing of what lies between: a plane that
   // touches it where the point is nearest stands for it (contact/surface.py, `Tangent`).
   void keep_outside(int i, const V* c, const Beside<V, D>& solid, Poses<V> free) {

@@ -4,13 +4,14 @@
 
 namespace pbfd {
 
-// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control.
+// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. grip: μ of the candidates; null: the plan's.
 template <class T, int D>
-inline void inspect(const Plan<T, D>& plan, const T* q, const T* v, const T* control, const T* at, T dt, Arena<T> arena, T* residual,
+inline void inspect(const Plan<T, D>& plan, const T* grip, const T* q, const T* v, const T* control, const T* at, T dt, Arena<T> arena, T* residual,
                     T* matrix) {
   Balance<T, T, D> balance(plan, arena);
   T* room = arena.take(18 * plan.nodes);
-  balance.dt = dt;
+  balance.dt = dt, balance.contacts.own_grip = grip;
+  balance.contacts.load(0, 0);
   for (int j = 0; j < plan.nu; j++) balance.control[j] = control[j];
   begin_energy_momentum(balance, q, v, room);
   balance.evaluate(at), balance.assemble(at, true);

@@ -12,10 +12,9 @@ PBFD_FUNCTION int pbfd_lanes(int bytes);
 // The kind of processor that the library is compiled for: "x86-64-v4", ...
 PBFD_FUNCTION const char* pbfd_target();
 
-// A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too; `each`: every world has its own numbers,
-// [worlds, count].
+// A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
-  int bytes, dimension, each, nodes, nq, nv, nu, candidates, planes, solids, samples, forms, pushes;
+  int bytes, dimension, nodes, nq, nv, nu, candidates, planes, solids, samples, forms, pushes;
   const int* whole;
   const void* real;
 };
@@ -38,6 +37,7 @@ struct pbfd_steps {
   void* found[9];
   void* residual_norm;
   int* counted[5];
+  const void* grip;  // μ of the candidates, [worlds, candidates]; null: the plan's
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.

@@ -19,11 +19,11 @@ Sizes sizes(const pbfd_plan* p) {
   return {{p->candidates, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->pushes};
 }
 
-template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class V, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
   Arena<V> arena{static_cast<V*>(room)};
-  Scenery<V, N, D> scenery(sizes(p), p->whole, static_cast<const T*>(p->real), arena);
-  Machine<V, N, D> machine(scenery, arena);
+  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
+  Machine<V, T, D> machine(plan, arena);
   auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
   auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
   const Journey<T> journey{
@@ -31,6 +31,7 @@ template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, cons
       given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), static_cast<const T*>(s->control),
       found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), static_cast<T*>(s->residual_norm),
       s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
+  machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
   machine.scheme.surplus_allowed = V(T(s->surplus));
   machine.run(journey, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
 }
@@ -38,27 +39,19 @@ template <class V, class N, int D> void energy_momentum(const pbfd_plan* p, cons
 template <class T, int D>
 void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   auto row = [](const void* array, long world, int count) { return static_cast<const T*>(array) + world * count; };
-  const int own = p->each ? Plan<T, D>::real_numbers(sizes(p)) : 0;
-  for (int w = s->first; w < s->last; w++) {
-    const Plan<T, D> plan(sizes(p), p->whole, row(p->real, w, own));
-    inspect(plan, row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq),
+  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
+  for (int w = s->first; w < s->last; w++)
+    inspect(plan, s->grip ? row(s->grip, w, p->candidates) : nullptr, row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq),
             T(s->dt), Arena<T>{static_cast<T*>(room)}, static_cast<T*>(residual) + long(w) * p->nv,
             static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
-  }
 }
 
 // A single world is spared the work of lanes that nobody needs.
 template <class T, int D> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  using V = Lanes<T, register_bytes / int(sizeof(T))>;
-  if (s->last - s->first == 1) {
-    pbfd_plan own = *p;
-    if (p->each) own.real = static_cast<const T*>(p->real) + long(s->first) * Plan<T, D>::real_numbers(sizes(p));
-    energy_momentum<T, T, D>(&own, s, room);
-  } else if (p->each) {
-    energy_momentum<V, V, D>(p, s, room);
-  } else {
-    energy_momentum<V, T, D>(p, s, room);
-  }
+  if (s->last - s->first == 1)
+    energy_momentum<T, D>(p, s, room);
+  else
+    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>, D>(p, s, room);
 }
 
 }  // namespace
@@ -73,11 +66,9 @@ long pbfd_real_numbers(const pbfd_plan* p) {
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
-  using Wide = Lanes<double, register_bytes / 8>;
-  using Narrow = Lanes<float, register_bytes / 4>;
-  const int wide = Machine<Wide, Wide>::room(sizes(p)), narrow = Machine<Narrow, Narrow>::room(sizes(p));
-  const int numbers = p->each ? Plan<Wide>::real_numbers(sizes(p)) : 0;
-  return long(register_bytes) * (numbers + (wide > narrow ? wide : narrow));
+  const int wide = Machine<Lanes<double, register_bytes / 8>, double>::room(sizes(p));
+  const int narrow = Machine<Lanes<float, register_bytes / 4>, float>::room(sizes(p));
+  return long(register_bytes) * (wide > narrow ? wide : narrow);
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {

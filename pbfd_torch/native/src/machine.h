@@ -2,7 +2,6 @@
 // or another world, at once (the paper's Fig. 3).
 #pragma once
 #include "energy_momentum.h"
-#include "scenery.h"
 #include "standstill.h"
 
 namespace pbfd {
@@ -31,14 +30,13 @@ template <class V, class N, int D = 3> struct Machine {
   EnergyMomentum<V, N, D> scheme;
   Velocities<V> before, after;
   V *q, *guess, *velocity, *room_to_begin;
-  Scenery<V, N, D>& scenery;
 
   static int room(Sizes s) {
     return Newton<V, N, D>::room(s) + EnergyMomentum<V, N, D>::room(s) + 11 * s.nv + 2 * s.nq + 18 * s.nodes;
   }
-  Machine(Scenery<V, N, D>& scenes, Arena<V>& arena)
-      : plan(scenes.plan), newton(plan, arena), scheme(plan, arena), before(Velocities<V>::in(arena, plan)),
-        after(Velocities<V>::in(arena, plan)), scenery(scenes) {
+  Machine(const Plan<N, D>& scene, Arena<V>& arena)
+      : plan(scene), newton(plan, arena), scheme(plan, arena), before(Velocities<V>::in(arena, plan)),
+        after(Velocities<V>::in(arena, plan)) {
     q = arena.take(plan.nq), guess = arena.take(plan.nq), velocity = arena.take(plan.nv);
     room_to_begin = arena.take(18 * plan.nodes);
   }
@@ -78,7 +76,7 @@ template <class V, class N, int D = 3> struct Machine {
     const bool found = next < end;
     const int from = found ? next++ : end - 1;
     world[i] = found ? from : -1, step[i] = journey->made[from];
-    load(i, from), steer(i, from), scenery.enter(i, from);
+    load(i, from), steer(i, from);
     return found;
   }
 
@@ -186,6 +184,7 @@ template <class V, class N, int D = 3> struct Machine {
     for (int j = 0; j < plan.nu; j++) put(newton.balance.control[j], i, journey->control[row * plan.nu + j]);
   }
   void load(int i, int from) {
+    newton.balance.contacts.load(i, from);
     const Journey<T>& a = *journey;
     auto read = [&](const T* array, V* to, int count) {
       for (int j = 0; j < count; j++) put(to[j], i, array[long(from) * count + j]);

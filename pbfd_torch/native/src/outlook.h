@@ -73,6 +73,7 @@ template <class V, class N, int D = 3> struct Outlook {
   template <class Pair> void foresee(Contacts<V, N, D>& contacts, Pair pair, int i, typename Kind<V>::Mask where) {
     using Surface = typename Pair::Surface;
     using Support = typename Pair::Support;
+    constexpr bool simple = Surface::flat && !Support::wanders;  // its depth knows nothing of the body's rotation
     const int k = contacts.candidates.carrier[i];
     const V zero(0), *t = twist + S * k, *e = drift + S * k;
     Touching<V, D> at;
@@ -83,7 +84,7 @@ template <class V, class N, int D = 3> struct Outlook {
     swing<D>(t, c, v), swing<D>(e, c, a);
     for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
     add_swing<D>(t, v, a);
-    if constexpr (!Surface::flat || Support::wanders) {
+    if constexpr (!simple) {
       contacts.touch(pair, i, at);
       add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
     }
@@ -100,19 +101,25 @@ template <class V, class N, int D = 3> struct Outlook {
     }
     const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
     if (!any((at.depth + grows > zero) & where)) return;
-    if constexpr (Surface::flat && !Support::wanders) {
+    if constexpr (simple) {
       contacts.touch(pair, i, at);
       if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
     }
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
-    V u[D], first[D], second[D];
-    at.template travel<Surface, Support>(u);
+    V u[D];
+    at.template travel<Support>(u);
+    slide(out, u, n, v, a, faster);
+  }
+
+  // How the square of the slip grows that is now what u has along the plane, of a surface that moves like this.
+  [[gnu::noinline]] static void slide(Coming<V>& out, V* u, const V* n, const V* v, const V* a, V faster) {
+    V first[D], second[D];
     const V lifted = dot<D>(u, n);
     for (int j = 0; j < D; j++) {
       u[j] = fma(-lifted, n[j], u[j]);
-      first[j] = fma(sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
+      first[j] = fma(out.sinks, n[j], v[j]), second[j] = fma(faster, n[j], a[j]);
     }
     out.size = dot<D>(u, u), out.along = dot<D>(u, first);
     out.square = dot<D>(first, first) + dot<D>(u, second), out.cube = dot<D>(first, second);

@@ -134,11 +134,12 @@ struct Drum {
   }
 };
 
-// A solid in its frame.
+// A solid in its frame. Out of line: there are many, and several that ask.
 template <class Solid> struct Placed {
   static constexpr bool flat = false, exact = Solid::exact, convex = Solid::convex;
 
-  template <class V, class N> static void beside(const Candidates<N, 3>& c, int i, const V* point, Beside<V, 3>& out) {
+  template <class V, class N>
+  [[gnu::noinline]] static void beside(const Candidates<N, 3>& c, int i, const V* point, Beside<V, 3>& out) {
     const N* frame = c.frame + 12 * c.solid[i];
     V p[3], n[3];
     seen(frame, point, p);
@@ -152,7 +153,8 @@ template <class Solid> struct Placed {
   }
 
   // Of ∇φ/‖∇φ‖: (1 − n nᵀ) ∇∇φ/‖∇φ‖.
-  template <class V, class N> static void bend(const Candidates<N, 3>& c, int i, const V* point, const Beside<V, 3>& at, V* out) {
+  template <class V, class N>
+  [[gnu::noinline]] static void bend(const Candidates<N, 3>& c, int i, const V* point, const Beside<V, 3>& at, V* out) {
     const N* frame = c.frame + 12 * c.solid[i];
     V p[3], R[9], own[9], half[9];
     seen(frame, point, p);

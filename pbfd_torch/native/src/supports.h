@@ -51,7 +51,7 @@ struct Ellipsoid {
   }
 
   template <bool FLAT, class V, class N>
-  static void arm(const Candidates<N, 3>& c, int i, const V* R, const V* n, const V* bend, Arm<V, 3>& out) {
+  [[gnu::noinline]] static void arm(const Candidates<N, 3>& c, int i, const V* R, const V* n, const V* bend, Arm<V, 3>& out) {
     V M[9], half[9], y[3], lean[3];
     product(R, c.ellipsoid + 9 * c.form[i], half);
     product_transposed(half, R, M);
@@ -88,7 +88,7 @@ struct Ellipsoid {
   // h'' less what ω̇ makes of it and what a material point at p does, of a body that spins at ω: with η = −ω × n
   // (ηᵀM η − (s·η)²)/h − n·(ω × (ω × s)).
   template <class V, class N>
-  static V bulge(const Candidates<N, 3>& c, int i, const V* R, const V* n, const Arm<V, 3>& arm, const V* spin) {
+  [[gnu::noinline]] static V bulge(const Candidates<N, 3>& c, int i, const V* R, const V* n, const Arm<V, 3>& arm, const V* spin) {
     V turning[3], own[3], spread[3], swept[3], inward[3];
     cross(n, spin, turning);
     transposed_times(R, turning, own);

@@ -22,17 +22,18 @@ template <class V, int D> struct Touching {
   const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
 
   // m
-  template <class Surface, class Support> void travel(V* out) const {
+  template <class Support> void travel(V* out) const {
     for (int j = 0; j < D; j++) out[j] = moved[j];
     if constexpr (Support::rolls) add_swing<D>(turn, arm.s, out);
   }
 };
 
-template <class Surface, class Support, class V, int D> inline void press(const Touching<V, D>& t, Push<V, D>& out) {
+// `FLAT`: the normal does not turn, and the depth is the distance itself.
+template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press(const Touching<V, D>& t, Push<V, D>& out) {
   constexpr int T = turns(D), S = T + D;
   const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
   V m[D], u[D], p[D], f[D];
-  t.template travel<Surface, Support>(m);
+  t.template travel<Support>(m);
   const V lifted = dot<D>(m, n);
   for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], m[j]), p[j] = Support::rolls ? c[j] + s[j] : c[j];
   V push, rises, factor, falls;
@@ -56,13 +57,13 @@ template <class Surface, class Support, class V, int D> inline void press(const 
   };
   for (int b = 0; b < D; b++) {  // w
     V slips[D], a[D], sinks = n[b];
-    if constexpr (!Surface::exact) sinks = t.solid.steepness * sinks;
-    if constexpr (Surface::flat) {
+    if constexpr (FLAT) {
       for (int j = 0; j < D; j++) slips[j] = fma(-n[b], n[j], V(j == b));
       answer(slips, sinks, a);
       wrench(b, D, a, nullptr, by_shift);
     } else {
       V tilt[D], shifted[D], move[D];
+      sinks = t.solid.steepness * sinks;
       for (int j = 0; j < D; j++) tilt[j] = t.bend[D * j + b], shifted[j] = t.arm.by_shift[D * j + b], move[j] = V(j == b);
       add_swing<D>(t.turn, shifted, move);
       if constexpr (Support::wanders) sinks = sinks - t.arm.reach_by_shift[b];
