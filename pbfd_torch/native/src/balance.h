@@ -23,10 +23,10 @@ template <class V, class N, int D = 3> struct Balance {
   V* arms;  // κ Σ m p̃ of all that a node moves
   // at the configuration
   Poses<V> now;
-  V *axes, *chord_axes, *chord, *residual, *slopes, *matrix, *turns_;
+  V *axes, *chord_axes, *chord, *residual, *slopes, *matrix, *rolls;
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
-  bool* turned;
+  bool* turned;  // which `rolls`, rotations of nodes over the step, are known
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
@@ -42,7 +42,7 @@ template <class V, class N, int D = 3> struct Balance {
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), turns_ = arena.take(3 * plan.nodes);
+    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), rolls = arena.take(3 * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
     pushes = taken<Push<V, D>>(arena, plan.nodes), turned = taken<bool>(arena, plan.nodes);
@@ -64,7 +64,7 @@ template <class V, class N, int D = 3> struct Balance {
       pushes[k].any = false;
     }
     pull_all();
-    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns_, turned);
+    contacts(plan, ContactStep<V>{start, dt}, now, pushes, rolls, turned);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
     for (int i = 0; i < plan.nv; i++) residual[i] = slopes[i] = V(0);
@@ -77,7 +77,7 @@ template <class V, class N, int D = 3> struct Balance {
       }
   }
 
-  // J, or with `curved` false the stiffness: J without how the axes turn under the forces.
+  // J, or with `curved` false the stiffness: J without how the axes turn under the forces. After it J needs another `evaluate`.
   void assemble(const V* q, bool curved) {
     if (!curved) let_go(now), pull_all();
     for (int k = 0; k < plan.nodes; k++) {
@@ -136,7 +136,7 @@ template <class V, class N, int D = 3> struct Balance {
           turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
         }
     }
-    if (!curved) let_go(target), pull_all();
+    if (!curved) let_go(target);
   }
 
   JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }

@@ -25,7 +25,7 @@ template <class V, class N, int D> inline V height(const Plan<N, D>& plan, int i
 template <class V, class N, int D>
 inline void contacts(const Plan<N, D>& plan, const ContactStep<V>& step, Poses<V> now, Push<V, D>* pushes, V* rolls, bool* turned) {
   constexpr int T = turns(D), S = T + D;
-  const V zero(0), range = V(plan.release[0]) * step.dt, width = V(plan.slip_speed[0]) * step.dt;
+  const V zero(0), per_dt = V(1) / step.dt, per_range = per_dt * V(N(1) / plan.release[0]), per_width = per_dt * V(N(1) / plan.slip_speed[0]);
   for (int k = 0; k < plan.nodes; k++) turned[k] = false;
   for (int i = 0; i < plan.candidates; i++) {
     V c[D], before[D], n[D];
@@ -47,9 +47,9 @@ inline void contacts(const Plan<N, D>& plan, const ContactStep<V>& step, Poses<V
     V u[D], p[D];
     for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], moved[j]), p[j] = fma(-radius, n[j], c[j]);
     V N_, rises, factor, falls;
-    releasing(V(plan.firmness[i]), depth, start, range, N_, rises);
+    release_law(V(plan.firmness[i]), depth, start, per_range, N_, rises);
     const V size = sqrt(dot<D>(u, u)), mu = V(plan.grip[i]);
-    slip_factor(size, width, factor, falls);
+    slip_law(size, per_width, factor, falls);
     const V drag = mu * N_ * factor, by_depth = mu * rises * factor, by_size = mu * N_ * falls;
     V f[D];
     for (int j = 0; j < D; j++) f[j] = fma(N_, n[j], -(drag * u[j]));

@@ -22,7 +22,7 @@ template <class V, class N, int D = 3> struct Outlook {
   V *twist, *drift;  // [6] per node
   int contacts = 0, limits = 0;
   V base, slope;  // of what changes linearly
-  V range, width, limit_range;
+  V per_range, per_width, per_limit_range;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -38,7 +38,9 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     base = work, slope = curve, contacts = limits = 0;
-    range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt, limit_range = V(plan.limit_release[0]) * b.dt;
+    const V per_dt = V(1) / b.dt;
+    per_range = per_dt * V(N(1) / plan.release[0]), per_width = per_dt * V(N(1) / plan.slip_speed[0]);
+    per_limit_range = per_dt * V(N(1) / plan.limit_release[0]);
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
     for (int i = 0; i < plan.candidates; i++) {
@@ -61,8 +63,8 @@ template <class V, class N, int D = 3> struct Outlook {
       V moved[D], first[D], second[D];
       for (int j = 0; j < D; j++) moved[j] = c[j] - before[j];
       if (any(plan.radius[i] > N(0))) {  // the surface moves by φ × s beside its centre, s = −ρ n
-        V phi[T], beside[D];
-        rotation_between<D>(b.now.rotation + D * D * k, b.start.rotation + D * D * k, phi);
+        V *phi = b.rolls + 3 * k, beside[D];
+        if (!b.turned[k]) rotation_between<D>(b.now.rotation + D * D * k, b.start.rotation + D * D * k, phi), b.turned[k] = true;
         swing<D>(phi, n, beside);
         for (int j = 0; j < D; j++) moved[j] = fma(-radius, beside[j], moved[j]);
         swing<D>(t, n, beside);
@@ -85,6 +87,7 @@ template <class V, class N, int D = 3> struct Outlook {
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k], c = plan.q[k];
+      if (!any(plan.limit[i] > N(0))) continue;
       for (int side = 0; side < 2; side++) {
         const V sign = side ? V(1) : V(-1), bound = side ? V(plan.upper[i]) : V(plan.lower[i]);
         const V past = sign * (q[c] - bound), speed = sign * d[i];
@@ -135,9 +138,9 @@ template <class V, class N, int D = 3> struct Outlook {
   V of_contact(const Coming<V>& c, V a, V& df) const {
     const V deep = c.depth + a * fma(V(0.5) * a, c.faster, c.sinks), speed = fma(a, c.faster, c.sinks);
     V push, rises, factor, falls;
-    releasing(c.stiffness, deep, c.start, range, push, rises);
+    release_law(c.stiffness, deep, c.start, per_range, push, rises);
     const V square = c.size + a * (V(2) * c.along + a * (c.square + a * (c.cube + V(0.25) * a * c.fourth)));
-    slip_factor(sqrt(max(square, V(0))), width, factor, falls);
+    slip_law(sqrt(max(square, V(0))), per_width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
     const V drags = (rises * speed * factor + push * falls * on) * on + push * factor * further;
@@ -147,7 +150,7 @@ template <class V, class N, int D = 3> struct Outlook {
 
   V of_limit(const Stop<V>& s, V a, V& df) const {
     V push, rises;
-    releasing(s.stiffness, fma(a, s.speed, s.past), s.start, limit_range, push, rises);
+    release_law(s.stiffness, fma(a, s.speed, s.past), s.start, per_limit_range, push, rises);
     df = rises * s.speed * s.speed;
     return push * s.speed;
   }
