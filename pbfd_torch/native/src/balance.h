@@ -79,7 +79,7 @@ template <class V, class N, int D = 3> struct Balance {
       }
   }
 
-  // J, or with `curved` false the stiffness: J without how the axes turn under the forces.
+  // J, or with `curved` false the stiffness: J without how the axes turn under the forces. After it J needs another `evaluate`.
   void assemble(const V* q, bool curved) {
     if (!curved) let_go(now), pull_all();
     for (int k = 0; k < plan.nodes; k++) {
@@ -138,7 +138,7 @@ template <class V, class N, int D = 3> struct Balance {
           turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
         }
     }
-    if (!curved) let_go(target), pull_all();
+    if (!curved) let_go(target);
   }
 
   JointStep<V> steps() const { return {q_start, q_target, control, limits, dt, weight}; }

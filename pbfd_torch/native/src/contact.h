@@ -16,7 +16,7 @@ template <class V, class N, int D> struct Contacts {
   V* grip;                           // μ [candidates]
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
-  V dt;
+  V per_dt;
   V* share;  // of its normal force that a candidate gives
   V* guard;  // [2 + D] 1 where a plane stands for the solid, else 0, and its normal and offset
   // of the nodes at a configuration: the rotation since the start and how it answers a turn, where asked for
@@ -42,7 +42,7 @@ template <class V, class N, int D> struct Contacts {
 
   // The step begins at these poses, and would lead to `free` without contacts.
   void begin(Poses<V> start, Poses<V> free, V step) {
-    before = start, dt = step;
+    before = start, per_dt = V(1) / step;
     each_kind(candidates, [&](auto pair, int first, int last) {
       using Surface = typename decltype(pair)::Surface;
       using Support = typename decltype(pair)::Support;
@@ -128,7 +128,7 @@ template <class V, class N, int D> struct Contacts {
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
     t.firmness = V(candidates.firmness[i]), t.grip = grip[i];
-    t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
+    t.per_range = per_dt * V(N(1) / candidates.release[i]), t.per_width = per_dt * V(N(1) / candidates.slip_speed[i]);
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
     if (!turned[k]) turn(k);

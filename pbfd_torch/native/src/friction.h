@@ -4,11 +4,12 @@
 
 namespace pbfd {
 
-// s = (2 − y/ε)/ε below ε, 1/y above; and (ds/dy)/y, 0 where nothing slips.
-template <class V> inline void slip_factor(V size, V width, V& factor, V& slope) {
-  const V larger = max(size, width);
-  factor = (V(2) - min(size, width) / width) / larger;
-  slope = select(size > V(0), V(-1) / (larger * larger * select(size > V(0), size, V(1))), V(0));
+// s = (2 − y/ε)/ε below ε, 1/y above; and (ds/dy)/y, 0 where nothing slips. `per_width`: 1/ε.
+template <class V> inline void slip_law(V size, V per_width, V& factor, V& slope) {
+  const auto slips = size > V(0);
+  const V per_size = V(1) / select(slips, size, V(1)), per_larger = select(slips, min(per_size, per_width), per_width);
+  factor = (V(2) - min(size * per_width, V(1))) * per_larger;
+  slope = select(slips, -(per_larger * per_larger * per_size), V(0));
 }
 
 }  // namespace pbfd

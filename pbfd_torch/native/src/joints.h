@@ -81,17 +81,17 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
       if ((LOADS & ROUGH) && any(plan.dry[i] > N(0))) {
         V factor, falls;
         const V size = abs(moved);
-        slip_factor(size, V(plan.dry_speed[0]) * step.dt, factor, falls);
+        slip_law(size, V(1) / (V(plan.dry_speed[0]) * step.dt), factor, falls);
         r = fma(V(plan.dry[i]) * factor, moved, r);
         slope = fma(V(plan.dry[i]), fma(falls * size, size, factor), slope);
       }
       const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
       if ((LOADS & ROUGH) && any((under > zero) | (over > zero))) {
         V push, rises;
-        const V range = V(plan.limit_release[0]) * step.dt, stiffness = step.limits[i];
-        releasing(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), range, push, rises);
+        const V per_range = V(1) / (V(plan.limit_release[0]) * step.dt), stiffness = step.limits[i];
+        release_law(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), per_range, push, rises);
         r -= push, slope += rises;
-        releasing(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), range, push, rises);
+        release_law(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), per_range, push, rises);
         r += push, slope += rises;
       }
       residual[i] += r, slopes[i] += slope;

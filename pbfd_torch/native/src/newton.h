@@ -25,18 +25,18 @@ template <class V, class N, int D = 3> struct Newton {
   V tolerance, most;  // ‖r/scale‖; evaluations
   // where every lane stands
   V *q, *trial, *retreat, *direction, *step, *column, *diagonal;
-  V* allowed;  // 1 / (scale + rounding/tolerance) of each residual
+  V *allowed, *factors;  // 1 / (scale + rounding/tolerance) of each residual; of J or of the stiffness
   V length, start_work, low, low_work, low_curve, high, high_work, high_curve;
   V error, status, evaluations, iterations, far;
   M running, at_guess, at_retreat, searching;
   bool settled;  // every lane that does not run has been evaluated where it stays
 
-  static int room(Sizes s) { return Balance<V, N, D>::room(s) + Outlook<V, N, D>::room(s) + 3 * s.nq + 5 * s.nv; }
+  static int room(Sizes s) { return Balance<V, N, D>::room(s) + Outlook<V, N, D>::room(s) + 3 * s.nq + (5 + s.nv) * s.nv; }
 
   Newton(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
     q = arena.take(plan.nq), trial = arena.take(plan.nq), retreat = arena.take(plan.nq);
     direction = arena.take(plan.nv), step = arena.take(plan.nv), column = arena.take(plan.nv), diagonal = arena.take(plan.nv);
-    allowed = arena.take(plan.nv);
+    allowed = arena.take(plan.nv), factors = arena.take(plan.nv * plan.nv);
     for (int i = 0; i < plan.nv; i++) direction[i] = V(0);
     length = start_work = low = low_work = low_curve = high = high_work = high_curve = V(0);
     error = status = evaluations = iterations = V(0), far = V(1);
@@ -160,20 +160,22 @@ template <class V, class N, int D = 3> struct Newton {
     if (!assembled) balance.assemble(trial, true);
     V *newton = column, *saved = step;
     for (int i = 0; i < n; i++) newton[i] = -balance.residual[i];
-    // the slope of the work along the direction needs J after it is factored: r = −J y, and yᵀJy = −y·r
-    const V sign = factor_along_the_tree(plan, balance.matrix);
-    substitute_along_the_tree(plan, balance.matrix, newton);
+    for (int i = 0; i < n * n; i++) factors[i] = balance.matrix[i];
+    const V sign = factor_along_the_tree(plan, factors);
+    substitute_along_the_tree(plan, factors, newton);
     V work = against(newton);
     const M direct = (sign > V(0)) & descends(work);
-    V curve = -work;
+    V curve = -work;  // r = −J y, and yᵀJy = −y·r
     for (int i = 0; i < n; i++) saved[i] = newton[i];
     if (any(accept & !direct)) {
+      V *convex = newton, *curved = balance.matrix;
+      balance.matrix = factors;
       balance.assemble(trial, false);
-      V* convex = newton;
+      balance.matrix = curved;
       for (int i = 0; i < n; i++) convex[i] = -balance.residual[i];
-      for (int i = 0; i < n; i++) diagonal[i] = abs(balance.matrix[i * n + i]);
-      factor_along_the_tree(plan, balance.matrix);
-      substitute_along_the_tree(plan, balance.matrix, convex);
+      for (int i = 0; i < n; i++) diagonal[i] = abs(factors[i * n + i]);
+      factor_along_the_tree(plan, factors);
+      substitute_along_the_tree(plan, factors, convex);
       const V convex_work = against(convex);
       const M by_convex = descends(convex_work) & (!direct), by_newton = descends(work) & (!direct) & (!by_convex);
       for (int i = 0; i < n; i++) {
@@ -181,7 +183,6 @@ template <class V, class N, int D = 3> struct Newton {
         saved[i] = select(direct | by_newton, saved[i], select(by_convex, convex[i], plain));
       }
       work = against(saved);
-      balance.assemble(trial, true);
       curve = select(direct, curve, curvature(saved));
     }
     V turn(MAX_TURN);

@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, steepness, sinks, faster, stiffness, mu, range, width, size, along, square, cube, fourth;
+  V depth, start, steepness, sinks, faster, stiffness, mu, per_range, per_width, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -22,7 +22,7 @@ template <class V, class N, int D = 3> struct Outlook {
   V *twist, *drift;  // [6] per node
   int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
-  V limit_range;
+  V per_limit_range;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -38,7 +38,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     count = limits = 0, base = slope = zero;
-    limit_range = V(plan.limit_release[0]) * b.dt;
+    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt);
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
@@ -47,6 +47,7 @@ template <class V, class N, int D = 3> struct Outlook {
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k], c = plan.q[k];
+      if (!any(b.limits[i] > zero)) continue;
       for (int side = 0; side < 2; side++) {
         const V sign = side ? V(1) : V(-1), bound = side ? V(plan.upper[i]) : V(plan.lower[i]);
         const V past = sign * (q[c] - bound), speed = sign * d[i];
@@ -107,7 +108,7 @@ template <class V, class N, int D = 3> struct Outlook {
     }
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
-    out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
+    out.stiffness = at.firmness, out.mu = at.grip, out.per_range = at.per_range, out.per_width = at.per_width;
     V u[D];
     at.template travel<Support>(u);
     slide(out, u, n, v, a, faster);
@@ -153,9 +154,9 @@ template <class V, class N, int D = 3> struct Outlook {
   V of_contact(const Coming<V>& c, V a, V& df) const {
     const V deep = fma(c.steepness * a, fma(V(0.5) * a, c.faster, c.sinks), c.depth), speed = fma(a, c.faster, c.sinks);
     V push, rises, factor, falls;
-    releasing(c.stiffness, deep, c.start, c.range, push, rises);
+    release_law(c.stiffness, deep, c.start, c.per_range, push, rises);
     const V square = c.size + a * (V(2) * c.along + a * (c.square + a * (c.cube + V(0.25) * a * c.fourth)));
-    slip_factor(sqrt(max(square, V(0))), c.width, factor, falls);
+    slip_law(sqrt(max(square, V(0))), c.per_width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
     const V grows = rises * c.steepness * speed, drags = (grows * factor + push * falls * on) * on + push * factor * further;
@@ -165,7 +166,7 @@ template <class V, class N, int D = 3> struct Outlook {
 
   V of_limit(const Stop<V>& s, V a, V& df) const {
     V push, rises;
-    releasing(s.stiffness, fma(a, s.speed, s.past), s.start, limit_range, push, rises);
+    release_law(s.stiffness, fma(a, s.speed, s.past), s.start, per_limit_range, push, rises);
     df = rises * s.speed * s.speed;
     return push * s.speed;
   }

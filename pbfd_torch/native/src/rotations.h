@@ -40,12 +40,8 @@ template <class V> inline void sine_cosine(V angle, V& sine, V& cosine) {
   cosine = select(back | (quadrant > V(0.5)), -smaller, smaller);
 }
 
-// atan x for x ≥ 0, infinite too (Cephes' rational approximation).
-template <class V> inline V arctangent(V x) {
-  const auto steep = x > V(2.41421356237309504880), middle = x > V(0.66);
-  const V y = select(steep, V(1.57079632679489661923), select(middle, V(0.78539816339744830962), V(0)));
-  const V t = select(steep, V(-1) / x, select(middle, (x - V(1)) / (x + V(1)), x));
-  const V z = t * t;
+// atan(√z)/√z for √z below .66 (Cephes' rational approximation).
+template <class V> inline V arctangent_ratio(V z) {
   V p = V(-8.750608600031904122785e-1);
   p = fma(p, z, V(-1.615753718733365076637e1));
   p = fma(p, z, V(-7.500855792314704667340e1));
@@ -56,7 +52,15 @@ template <class V> inline V arctangent(V x) {
   q = fma(q, z, V(4.328810604912902668951e2));
   q = fma(q, z, V(4.853903996359136964868e2));
   q = fma(q, z, V(1.945506571482613964425e2));
-  return y + fma(t * z, p / q, t);
+  return fma(z, p / q, V(1));
+}
+
+// atan x for x ≥ 0, infinite too (Cephes' rational approximation).
+template <class V> inline V arctangent(V x) {
+  const auto steep = x > V(2.41421356237309504880), middle = x > V(0.66);
+  const V y = select(steep, V(1.57079632679489661923), select(middle, V(0.78539816339744830962), V(0)));
+  const V t = select(steep, V(-1) / x, select(middle, (x - V(1)) / (x + V(1)), x));
+  return fma(t, arctangent_ratio(t * t), y);
 }
 
 // A rotation matrix of a unit quaternion.
@@ -115,11 +119,14 @@ template <int D = 3, class V> inline void rotation_between(const V* A, const V* 
   product_transposed<D>(A, B, M);
   curl<D>(M, twice);
   const V square = V(0.25) * dot<turns(D)>(twice, twice), cosine = V(0.5) * (trace<D>(M) - V(D - 2));
-  const auto small = (square < V(SMALL * SMALL)) & (cosine > V(0));
-  const V sine = sqrt(select(small, V(1), max(square, V(1e-12))));
-  const V series = V(1) + square * V(1.0 / 6) * (V(1) + square * V(9.0 / 20) * (V(1) + square * V(25.0 / 42)));
-  const V angle = V(2) * arctangent(sine / max(V(1) + cosine, V(1e-12)));
-  const V scale = V(0.5) * select(small, series, angle / sine);
+  // the half angle's tangent is sin/(1 + cos)
+  const V per = V(1) / max(V(1) + cosine, V(1e-12)), tangent2 = square * per * per;
+  const auto wide = tangent2 > V(0.66 * 0.66);
+  V scale = per * arctangent_ratio(min(tangent2, V(0.66 * 0.66)));
+  if (any(wide)) {
+    const V sine = sqrt(max(square, V(1e-12)));
+    scale = select(wide, arctangent(sine * per) / sine, scale);
+  }
   for (int i = 0; i < turns(D); i++) v[i] = scale * twice[i];
 }
 

@@ -131,10 +131,49 @@ template <class T, int W> inline Lanes<T, W> fma(Lanes<T, W> a, Lanes<T, W> b, L
   return sum;
 }
 
+// a < b ? a : b and a > b ? a : b, as the machine's own instructions have it.
+inline double min(double a, double b) { return a < b ? a : b; }
+inline double max(double a, double b) { return a > b ? a : b; }
+inline double abs(double a) { return std::fabs(a); }
+inline float min(float a, float b) { return a < b ? a : b; }
+inline float max(float a, float b) { return a > b ? a : b; }
+inline float abs(float a) { return std::fabs(a); }
+
+template <class T, int W> inline Lanes<T, W> min(Lanes<T, W> a, Lanes<T, W> b) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(a.v) == 64 && sizeof(T) == 8)
+    return Lanes<T, W>((decltype(a.v))_mm512_maskz_min_pd(0xff, (__m512d)a.v, (__m512d)b.v));
+  if constexpr (sizeof(a.v) == 64 && sizeof(T) == 4)
+    return Lanes<T, W>((decltype(a.v))_mm512_maskz_min_ps(0xffff, (__m512)a.v, (__m512)b.v));
+#endif
+#if defined(__AVX2__)
+  if constexpr (sizeof(a.v) == 32 && sizeof(T) == 8) return Lanes<T, W>((decltype(a.v))_mm256_min_pd((__m256d)a.v, (__m256d)b.v));
+  if constexpr (sizeof(a.v) == 32 && sizeof(T) == 4) return Lanes<T, W>((decltype(a.v))_mm256_min_ps((__m256)a.v, (__m256)b.v));
+#endif
+  return select(a < b, a, b);
+}
+
+template <class T, int W> inline Lanes<T, W> max(Lanes<T, W> a, Lanes<T, W> b) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(a.v) == 64 && sizeof(T) == 8)
+    return Lanes<T, W>((decltype(a.v))_mm512_maskz_max_pd(0xff, (__m512d)a.v, (__m512d)b.v));
+  if constexpr (sizeof(a.v) == 64 && sizeof(T) == 4)
+    return Lanes<T, W>((decltype(a.v))_mm512_maskz_max_ps(0xffff, (__m512)a.v, (__m512)b.v));
+#endif
+#if defined(__AVX2__)
+  if constexpr (sizeof(a.v) == 32 && sizeof(T) == 8) return Lanes<T, W>((decltype(a.v))_mm256_max_pd((__m256d)a.v, (__m256d)b.v));
+  if constexpr (sizeof(a.v) == 32 && sizeof(T) == 4) return Lanes<T, W>((decltype(a.v))_mm256_max_ps((__m256)a.v, (__m256)b.v));
+#endif
+  return select(a > b, a, b);
+}
+
+template <class T, int W> inline Lanes<T, W> abs(Lanes<T, W> a) {
+  using Bits = typename Mask<T, W>::Bits;
+  const Bits sign = (Bits)Lanes<T, W>(T(-0.0)).v;
+  return Lanes<T, W>((decltype(a.v))((Bits)a.v & ~sign));
+}
+
 // Both ---------------------------------------------------------------------------------------------------------------------
-template <class V> inline V min(V a, V b) { return select(a < b, a, b); }
-template <class V> inline V max(V a, V b) { return select(a > b, a, b); }
-template <class V> inline V abs(V a) { return select(a < V(0), -a, a); }
 template <class V> inline V clamped(V a, V low, V high) { return min(max(a, low), high); }
 
 template <class V> inline V infinite() { return V(typename Kind<V>::Scalar(HUGE_VAL)); }

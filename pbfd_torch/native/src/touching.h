@@ -18,7 +18,7 @@ template <class V, int D> struct Touching {
   V bend[D * D];
   Arm<V, D> arm;
   V depth, start;          // at the end of the step and at its beginning
-  V firmness, grip, range, width;  // C⊥, μ; release speed and slip speed × Δt
+  V firmness, grip, per_range, per_width;  // C⊥, μ; 1 / (release speed and slip speed × Δt)
   const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
 
   // m
@@ -37,8 +37,8 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
   const V lifted = dot<D>(m, n);
   for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], m[j]), p[j] = Support::rolls ? c[j] + s[j] : c[j];
   V push, rises, factor, falls;
-  releasing(t.firmness, t.depth, t.start, t.range, push, rises);
-  slip_factor(sqrt(dot<D>(u, u)), t.width, factor, falls);
+  release_law(t.firmness, t.depth, t.start, t.per_range, push, rises);
+  slip_law(sqrt(dot<D>(u, u)), t.per_width, factor, falls);
   const V drag = t.grip * push * factor, by_depth = t.grip * rises * factor, by_size = t.grip * push * falls;
   for (int j = 0; j < D; j++) f[j] = fma(push, n[j], -(drag * u[j]));
 
