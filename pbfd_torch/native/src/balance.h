@@ -16,8 +16,10 @@ template <class V, class N> struct Balance {
   const Plan<N>& plan;
   // what is fixed in a step
   Poses<V> start, target;
-  V *q_start, *q_target, *control;
+  V *q_start, *q_target, *control, *fitted;
   V dt, weight, share;  // share = 1: inertia works at the end of the step
+  V inert;              // κ over the square of the length that inertia knows of
+  Relaxed<V> relaxed;
   bool on_chord;
   // at the configuration
   Poses<V> now, chord;
@@ -28,13 +30,15 @@ template <class V, class N> struct Balance {
 
   static int room(Sizes s) {  // in V, for the arena
     const int loads = int((sizeof(Pull<V>) + sizeof(Push<V>)) / sizeof(V)) + 3;
-    return s.nodes * (48 + 3 + loads) + 2 * s.nq + s.nu + 13 * s.nv + s.nv * s.nv;
+    return s.nodes * (48 + 3 + loads) + 2 * s.nq + s.nu + 14 * s.nv + s.nv * s.nv + s.candidates;
   }
 
   Balance(const Plan<N>& scene, Arena<V>& arena) : plan(scene) {
     start = Poses<V>::in(arena, plan), target = Poses<V>::in(arena, plan);
     now = Poses<V>::in(arena, plan), chord = Poses<V>::in(arena, plan);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
+    fitted = arena.take(plan.nv), relaxed.held = arena.take(plan.candidates);
+    relaxed.none();
     axes = arena.take(6 * plan.nv), chord_axes = arena.take(6 * plan.nv);
     residual = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv), turns = arena.take(3 * plan.nodes);
     pulls = reinterpret_cast<Pull<V>*>(arena.take(plan.nodes * int(sizeof(Pull<V>) / sizeof(V))));
@@ -56,11 +60,11 @@ template <class V, class N> struct Balance {
     for (int k = 0; k < plan.nodes; k++) {
       pushes[k].any = false;
       if (any(V(plan.mass[k]) > V(0)))
-        pull(plan, k, weight, share, start, target, now, pulls[k]);
+        pull(plan, k, inert, share, start, target, now, pulls[k]);
       else
         pulls[k].clear();  // a joint that only leads to others
     }
-    contacts(plan, ContactStep<V>{start, dt}, now, pushes, turns, turned);
+    contacts(plan, ContactStep<V>{start, dt, relaxed}, now, pushes, turns, turned);
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) {
         pulls[plan.parent[k]].add(pulls[k]);
@@ -126,7 +130,7 @@ template <class V, class N> struct Balance {
     joint_loads(plan, steps(), q, static_cast<V*>(nullptr), matrix);
   }
 
-  JointStep<V> steps() const { return {q_start, q_target, control, dt, weight}; }
+  JointStep<V> steps() const { return {q_start, q_target, control, fitted, dt, inert, relaxed}; }
 
  private:
   const V* inertial_axis(int j) const { return (on_chord ? chord_axes : axes) + 6 * j; }

@@ -2,6 +2,7 @@
 #pragma once
 #include "friction.h"
 #include "loads.h"
+#include "relaxed.h"
 #include "release.h"
 
 namespace pbfd {
@@ -10,6 +11,7 @@ namespace pbfd {
 template <class V> struct ContactStep {
   Poses<V> start;
   V dt;
+  const Relaxed<V>& relaxed;
 };
 
 template <class V, class N> inline V height(const Plan<N>& plan, int i, Poses<V> at, V* center) {
@@ -23,12 +25,13 @@ template <class V, class N> inline V height(const Plan<N>& plan, int i, Poses<V>
 // Adds the forces on all nodes, and how they answer; `turns` [3] and `turned` per node: room for their rotations over the step.
 template <class V, class N>
 inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> now, Push<V>* pushes, V* turns, bool* turned) {
-  const V zero(0), range = V(plan.release[0]) * step.dt, width = V(plan.slip_speed[0]) * step.dt;
+  const V zero(0), range = V(plan.release[0]) * step.dt, width = V(plan.slip_speed[0]) * step.dt * step.relaxed.width;
   for (int k = 0; k < plan.nodes; k++) turned[k] = false;
   for (int i = 0; i < plan.candidates; i++) {
     V c[3], before[3];
     const V reach = V(plan.radius[i]) + V(plan.margin[i]), depth = reach - height(plan, i, now, c);
-    if (!any(depth > zero)) continue;
+    const V holding = step.relaxed.holding(i);
+    if (!any((depth > zero) | (holding > zero))) continue;
     const int k = plan.carrier[i];
     const V radius = V(plan.radius[i]), start = reach - height(plan, i, step.start, before);
     const V n[3] = {V(plan.normal[3 * i]), V(plan.normal[3 * i + 1]), V(plan.normal[3 * i + 2])};
@@ -47,10 +50,12 @@ inline void contacts(const Plan<N>& plan, const ContactStep<V>& step, Poses<V> n
     V u[3], p[3];
     for (int j = 0; j < 3; j++) u[j] = fma(-lifted, n[j], moved[j]), p[j] = fma(-radius, n[j], c[j]);
     V N_, rises, factor, falls;
-    releasing(V(plan.firmness[i]), depth, start, range, N_, rises);
+    releasing(step.relaxed.firmness * V(plan.firmness[i]), depth, start, range, N_, rises);
     const V size = sqrt(dot(u, u)), mu = V(plan.grip[i]);
     slip_factor(size, width, factor, falls);
-    const V drag = mu * N_ * factor, by_depth = mu * rises * factor, by_size = mu * N_ * falls;
+    V pressed = N_, firmer = rises;
+    step.relaxed.felt(holding, pressed, firmer);
+    const V drag = mu * pressed * factor, by_depth = mu * firmer * factor, by_size = mu * pressed * falls;
     V f[3];
     for (int j = 0; j < 3; j++) f[j] = fma(N_, n[j], -(drag * u[j]));
 

@@ -41,13 +41,35 @@ template <class V, class N> inline void aim(Balance<V, N>& b, const V* v, V fall
   }
 }
 
-// The energy–momentum step from q_n with v_n: κ = 1/Δt², T̂ = T_n + Δt V_n + ½ Δt² [0 | g], inertia in the middle of the chord.
+// Half the integral of ρ ẋ² over all bodies whose poses change at `rates`, [12] each.
+template <class V, class N> inline V kinetic_energy(const Plan<N>& plan, const V* rates) {
+  V twice(0);
+  for (int k = 0; k < plan.nodes; k++, rates += 12) {
+    V spread[9], speed[3];
+    product(rates, plan.second + 9 * k, spread);
+    for (int i = 0; i < 9; i++) twice = fma(spread[i], rates[i], twice);
+    times(rates, plan.center + 3 * k, speed);
+    for (int i = 0; i < 3; i++) speed[i] += rates[9 + i];
+    twice = fma(V(plan.mass[k]), dot(speed, speed), twice);
+  }
+  return V(0.5) * twice;
+}
+
+// Kinetic energy of the bodies' fall over one step, at 1 m/s² at least.
+template <class V, class N> inline V falling_energy(const Plan<N>& plan, V dt) {
+  V mass(0);
+  for (int k = 0; k < plan.nodes; k++) mass += V(plan.mass[k]);
+  const V g[3] = {V(plan.gravity[0]), V(plan.gravity[1]), V(plan.gravity[2])}, strength = max(sqrt(dot(g, g)), V(1));
+  return V(0.5) * mass * (dt * strength) * (dt * strength);
+}
+
+// The energy–momentum step from q_n with v_n: κ = 1/Δt², T̂ = T_n + Δt V_n + ½ Δt² [0 | g]; inertia works on the chord.
 // room: 18 per node.
 template <class V, class N> inline void begin_energy_momentum(Balance<V, N>& b, const V* q, const V* v, V* room) {
   for (int i = 0; i < b.plan.nq; i++) b.q_start[i] = q[i];
   place(b.plan, q, b.start);
   motion_axes(b.plan, b.start, b.axes);
-  b.weight = V(1) / (b.dt * b.dt), b.share = V(0.5), b.on_chord = true;
+  b.weight = V(1) / (b.dt * b.dt), b.on_chord = true;
   aim(b, v, V(0.5) * b.dt * b.dt, room);
   retract(b.plan, q, v, b.dt, b.q_target);
 }

@@ -6,7 +6,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 3; }
+int pbfd_interface() { return 4; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -14,30 +14,30 @@ const char* pbfd_target() { return target; }
 
 namespace {
 
-Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates}; }
+Sizes sizes(const pbfd_plan* p) { return {p->nodes, p->nq, p->nv, p->nu, p->candidates, p->halvings}; }
 
-template <class V> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <template <class, class> class Scheme, class V> void make(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
   const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   Arena<V> arena{static_cast<V*>(room)};
-  Machine<V, T> machine(plan, arena);
-  auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
-  auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
-  const Journey<T> journey{
-      s->worlds, s->steps, s->held != 0, s->made,
-      given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), static_cast<const T*>(s->control),
-      found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), static_cast<T*>(s->residual_norm),
-      s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
-  machine.scheme.surplus_allowed = V(T(s->surplus));
-  machine.run(journey, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
+  Machine<V, T, Scheme<V, T>> machine(plan, arena);
+  const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
+                           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
+  machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, p->halvings, s->evaluations}, s->first, s->last);
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <class T> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <template <class, class> class Scheme, class T> void make_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   if (s->last - s->first == 1)
-    energy_momentum<T>(p, s, room);
+    make<Scheme, T>(p, s, room);
   else
-    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>>(p, s, room);
+    make<Scheme, Lanes<T, register_bytes / int(sizeof(T))>>(p, s, room);
+}
+
+// Room for lanes of V, in bytes.
+template <class V, class T> long room_of(Sizes s) {
+  const int one = Machine<V, T, EnergyMomentum<V, T>>::room(s), other = Machine<V, T, ImplicitEuler<V, T>>::room(s);
+  return long(sizeof(V)) * (one > other ? one : other);
 }
 
 }  // namespace
@@ -48,11 +48,15 @@ long pbfd_real_numbers(const pbfd_plan* p) { return Plan<double>::real_numbers(s
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
-  const int wide = Machine<Lanes<double, register_bytes / 8>, double>::room(sizes(p));
-  const int narrow = Machine<Lanes<float, register_bytes / 4>, float>::room(sizes(p));
-  return long(register_bytes) * (wide > narrow ? wide : narrow);
+  const long wide = room_of<Lanes<double, register_bytes / 8>, double>(sizes(p));
+  const long narrow = room_of<Lanes<float, register_bytes / 4>, float>(sizes(p));
+  return wide > narrow ? wide : narrow;
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  p->bytes == 8 ? energy_momentum_of<double>(p, s, room) : energy_momentum_of<float>(p, s, room);
+  p->bytes == 8 ? make_of<EnergyMomentum, double>(p, s, room) : make_of<EnergyMomentum, float>(p, s, room);
+}
+
+void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  p->bytes == 8 ? make_of<ImplicitEuler, double>(p, s, room) : make_of<ImplicitEuler, float>(p, s, room);
 }

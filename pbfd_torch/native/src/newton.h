@@ -11,8 +11,10 @@ constexpr double NEGLIGIBLE = 0.1;     // of the scale, at most, may be left to 
 constexpr double RETREAT_ABOVE = 2.0;  // ‖r/scale‖ at the guess
 constexpr double OVERSHOOT = 0.5;      // of the work at the start
 constexpr double MAX_TURN = 1.0;       // [rad] of a joint in one step of Newton's
+constexpr double ABSURD = 1e6;         // what drives the bodies may move them by so many times their extent in a step, or [rad]
 
-enum Status { SOLVED = 0, STALLED = 5, ITERATION_LIMIT = 6, NON_FINITE = 7 };  // as solvers/objective.py
+// As solvers/objective.py: up to HALVED the step is solved.
+enum Status { SOLVED, WARM_STARTED, CONTINUED, EASED, HALVED, STALLED, ITERATION_LIMIT, NON_FINITE };
 
 template <class V, class N> struct Newton {
   using T = typename Kind<V>::Scalar;
@@ -24,24 +26,25 @@ template <class V, class N> struct Newton {
   Outlook<V, N> outlook;
   V tolerance, most;  // ‖r/scale‖; evaluations
   // where every lane stands
-  V *q, *trial, *retreat, *direction, *step, *column, *diagonal;
+  V *q, *trial, *retreat, *direction, *step, *column, *diagonal, *driven;
   V length, start_work, low, low_work, low_curve, high, high_work, high_curve;
   V error, status, evaluations, iterations, far;
   M running, at_guess, at_retreat, searching;
 
-  static int room(Sizes s) { return Balance<V, N>::room(s) + Outlook<V, N>::room(s) + 3 * s.nq + 4 * s.nv; }
+  static int room(Sizes s) { return Balance<V, N>::room(s) + Outlook<V, N>::room(s) + 3 * s.nq + 5 * s.nv; }
 
   Newton(const Plan<N>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
     q = arena.take(plan.nq), trial = arena.take(plan.nq), retreat = arena.take(plan.nq);
     direction = arena.take(plan.nv), step = arena.take(plan.nv), column = arena.take(plan.nv), diagonal = arena.take(plan.nv);
+    driven = arena.take(plan.nv);
     for (int i = 0; i < plan.nv; i++) direction[i] = V(0);
     length = start_work = low = low_work = low_curve = high = high_work = high_curve = V(0);
     error = status = evaluations = iterations = V(0), far = V(1);
     running = at_guess = at_retreat = searching = M(false);
   }
 
-  // Lanes set out from a guess; θ_n is their retreat. Their balance has been begun.
-  void begin(M which, const V* guess) {
+  // Lanes set out from a guess; θ_n is the retreat of those that have one. Their balance has been begun.
+  void begin(M which, const V* guess, M safe) {
     for (int i = 0; i < plan.nq; i++) {
       q[i] = select(which, guess[i], q[i]), trial[i] = select(which, guess[i], trial[i]);
       retreat[i] = select(which, balance.q_start[i], retreat[i]);
@@ -49,8 +52,8 @@ template <class V, class N> struct Newton {
     V farthest(0);
     for (int i = 0; i < 3 * plan.nodes; i++) farthest = max(farthest, abs(balance.start.position[i]));
     far = select(which, farthest + V(plan.reach[0]), far);
-    running = running | which, at_guess = at_guess | which;
-    searching = searching & !which, at_retreat = at_retreat & !which;
+    running = running | which, searching = searching & !which;
+    at_guess = (at_guess & !which) | (which & safe), at_retreat = (at_retreat & !which) | (which & !safe);
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
     error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status), high = select(which, infinite<V>(), high);
   }
@@ -61,9 +64,11 @@ template <class V, class N> struct Newton {
     balance.evaluate(trial);
     bool assembled = false;
     const V reached = judged(assembled);
-    M finite = reached < infinite<V>();
+    const M finite = reached < infinite<V>();
     const M retreating = running & at_guess & !(finite & (reached <= V(RETREAT_ABOVE)));
-    const M lost = running & at_retreat & !finite, usable = running & finite & !retreating;
+    M hopeless = !finite;
+    if (any(running & at_retreat)) hopeless = hopeless | absurd();
+    const M lost = running & at_retreat & hopeless, usable = running & finite & !retreating & !lost;
     const M arrived = usable & (reached <= tolerance);
     evaluations += select(running, V(1), V(0));
     iterations += select(arrived & searching, V(1), V(0));
@@ -116,6 +121,16 @@ template <class V, class N> struct Newton {
       lenient = fma(a, a, lenient);
     }
     return select(near, max(sqrt(lenient), least), first);
+  }
+
+  // Where the forces are not to be balanced (`BalanceObjective.absurd`): what drives the bodies would move them beyond all reason.
+  M absurd() {
+    for (int i = 0; i < plan.nv; i++) driven[i] = V(0);
+    joint_loads<SMOOTH | DRY>(plan, balance.steps(), trial, driven, static_cast<V*>(nullptr));
+    M found(false);
+    for (int i = 0; i < plan.nv; i++)
+      found = found | (abs(driven[i]) > V(ABSURD) * balance.weight * fma(far, V(plan.heft[i]), V(plan.armature[i])));
+    return found;
   }
   V extent(int j) const { return select(V(plan.turns[j]) > V(0), V(1), far); }
 

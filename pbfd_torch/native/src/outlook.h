@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, sinks, faster, stiffness, mu, size, along, square, cube, fourth;
+  V depth, start, sinks, faster, stiffness, mu, holding, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -22,6 +22,7 @@ template <class V, class N> struct Outlook {
   int contacts = 0, limits = 0;
   V base, slope;  // of what changes linearly
   V range, width, limit_range;
+  const Relaxed<V>* relaxed;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -37,7 +38,8 @@ template <class V, class N> struct Outlook {
     const Plan<N>& plan = b.plan;
     const V zero(0);
     base = work, slope = curve, contacts = limits = 0;
-    range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt, limit_range = V(plan.limit_release[0]) * b.dt;
+    relaxed = &b.relaxed, range = V(plan.release[0]) * b.dt, width = V(plan.slip_speed[0]) * b.dt * relaxed->width;
+    limit_range = V(plan.limit_release[0]) * b.dt;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
     for (int i = 0; i < plan.candidates; i++) {
@@ -54,10 +56,11 @@ template <class V, class N> struct Outlook {
       for (int j = 0; j < 3; j++) a[j] += e[3 + j];
       add_cross(t, v, a);
       const V sinks = -dot(v, n), faster = -dot(a, n);
-      if (!any((depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) continue;
+      const V holding = relaxed->holding(i);
+      if (!any(((depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) | (holding > zero)) & where)) continue;
       Coming<V>& out = coming[contacts++];
       out.depth = depth, out.start = reach - height(plan, i, b.start, before), out.sinks = sinks, out.faster = faster;
-      out.stiffness = V(plan.firmness[i]), out.mu = V(plan.grip[i]);
+      out.stiffness = relaxed->firmness * V(plan.firmness[i]), out.mu = V(plan.grip[i]), out.holding = holding;
       V moved[3], first[3], second[3];
       for (int j = 0; j < 3; j++) moved[j] = c[j] - before[j];
       if (any(radius > zero)) {  // the surface moves by φ × s beside its centre, s = −ρ n
@@ -89,7 +92,7 @@ template <class V, class N> struct Outlook {
         const V past = sign * (q[c] - bound), speed = sign * d[i];
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
-        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
+        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), relaxed->firmness * V(plan.limit[i])};
         V df;
         base -= of_limit(out, zero, df);
         slope -= df;
@@ -141,9 +144,11 @@ template <class V, class N> struct Outlook {
     slip_factor(sqrt(max(square, V(0))), width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    const V drags = (rises * speed * factor + push * falls * on) * on + push * factor * further;
+    V pressed = push, firmer = rises;
+    relaxed->felt(c.holding, pressed, firmer);
+    const V drags = (firmer * speed * factor + pressed * falls * on) * on + pressed * factor * further;
     df = rises * speed * speed + push * c.faster + c.mu * drags;
-    return push * speed + c.mu * push * factor * on;
+    return push * speed + c.mu * pressed * factor * on;
   }
 
   V of_limit(const Stop<V>& s, V a, V& df) const {

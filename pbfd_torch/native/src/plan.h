@@ -12,7 +12,7 @@ inline int coordinates(int kind) { return kind == FREE ? 7 : kind == BALL ? 4 : 
 inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; }
 
 struct Sizes {
-  int nodes, nq, nv, nu, candidates;
+  int nodes, nq, nv, nu, candidates, halvings;
 };
 
 template <class N> struct Plan : Sizes {
@@ -25,7 +25,7 @@ template <class N> struct Plan : Sizes {
   const N *scale;  // what counts as a force of one
   const N *heft;   // [kg, kg m] what rounded positions weigh
   const N *turns;  // 1 where it rotates, else 0
-  const N *share;  // θ of springs, damping and actuators (`Fitted`), 1 where all is implicit
+  const N *share;  // θ of springs, damping and actuators (`Fitted`), 1 where all is implicit: [nv] of steps Δt, Δt/2, Δt/4 …
   const N *spring, *damping, *armature, *dry, *lower, *upper, *limit;
   const N *rest;  // [nq] of the springs
   // actuators
@@ -49,7 +49,7 @@ template <class N> struct Plan : Sizes {
     carrier = whole(candidates);
     frame = real(9 * nodes), origin = real(3 * nodes), axis = real(3 * nodes), reference = real(nodes);
     mass = real(nodes), center = real(3 * nodes), second = real(9 * nodes);
-    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
+    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv * (1 + halvings));
     spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
@@ -60,7 +60,7 @@ template <class N> struct Plan : Sizes {
   }
 
   static int whole_numbers(Sizes s) { return 4 * s.nodes + 2 * s.nu + s.candidates; }
-  static int real_numbers(Sizes s) { return 29 * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + 12 * s.candidates + 8; }
+  static int real_numbers(Sizes s) { return 29 * s.nodes + (11 + s.halvings) * s.nv + s.nq + 9 * s.nu + 12 * s.candidates + 8; }
 };
 
 // Memory that the caller owns, handed out piece by piece.
