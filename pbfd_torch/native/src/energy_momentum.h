@@ -66,8 +66,9 @@ template <class V, class N> struct EnergyMomentum {
 
   // How often a step had better be halved before it is made easier, if that which ended like this is unsolved or refused.
   V halves(const Balance<V, N>& b, Sight<V, N>& sight, const State& after, M solved) const {
-    const M held = sight.pushes(b, b.q_start) | sight.pushes(b, b.q_target) | sight.pushes(b, after.q);
-    M fast(false);
+    M held = sight.pushes(b, b.q_start), fast(false);
+    held = held | sight.pushes(b, b.q_target);
+    held = held | sight.pushes(b, after.q);  // the last look, which `fast` goes by
     for (int k = 0; k < plan.nodes; k++) {
       V traced(0);
       for (int j = 0; j < 9; j++) traced = fma(sight.there.rotation[9 * k + j], b.start.rotation[9 * k + j], traced);

@@ -55,10 +55,8 @@ template <class T, bool EASIER> struct Itinerary {
   T parts_error;
 
   Then after_part(const Rules& rules, int ended, T reached, int found) {
-    parts_hazards |= found;
-    parts_error = max(parts_error, reached);
     if (ended <= HALVED) {
-      eased = false;
+      eased = false, parts_hazards |= found, parts_error = max(parts_error, reached);
       if (++part == 1 << halvings) return status = HALVED, error = parts_error, hazards = parts_hazards, END_OF_PARTS;
       return begin_part(), NEXT_PART;
     }

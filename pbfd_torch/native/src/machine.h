@@ -178,7 +178,8 @@ template <class V, class N, class Scheme> struct Machine {
     if (any(better))
       for (int i = 0; i < plan.nq; i++) found[i] = select(better, newton.q[i], found[i]);
     if (any(led))
-      for (int i = 0; i < plan.nq; i++) newton.q[i] = newton.trial[i] = select(led, found[i], newton.trial[i]);
+      for (int i = 0; i < plan.nq; i++)
+        newton.q[i] = select(led, found[i], newton.q[i]), newton.trial[i] = select(led, found[i], newton.trial[i]);
     return any(over) ? fresh | conclude(over) : fresh;
   }
   int status(int i) const { return int(lane(newton.status, i)); }
