@@ -50,7 +50,7 @@ template <class V, class N, class Scheme> struct Machine {
     scheme.ask(rules);
     newton.running = M(false);
     M fresh(false);
-    for (int i = 0; i < W; i++) put(fresh, i, board(i));
+    for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     while (any_aboard()) {
       set_out(fresh);
       do newton.pass();
@@ -68,6 +68,7 @@ template <class V, class N, class Scheme> struct Machine {
   int step[W];   // of that world
   Itinerary<T, Scheme::easier> trips[W];
   Fallbacks<T> ways[W];
+  bool plainly[W];  // it is posed the step itself
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
@@ -92,8 +93,11 @@ template <class V, class N, class Scheme> struct Machine {
   void depart(int i) { steer(i), trips[i].begin(rules), attempt(i); }
   void attempt(int i) { ways[i].begin(), pose(i); }
 
-  // What a lane is to solve next.
+  // What a lane is to solve next. Most have just made a step, and are to make one.
   void pose(int i) {
+    const bool plain = trips[i].first() && ways[i].way == DIRECTLY;
+    if (plain && plainly[i]) return;
+    plainly[i] = plain;
     Balance<V, N>& b = newton.balance;
     const int halvings = trips[i].halvings;
     const Stage problem = ways[i].problem();
