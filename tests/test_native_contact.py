@@ -91,7 +91,7 @@ def require_balance(scene: Scene, state: Velocities, q: Tensor, exact: float = 1
     """The core's r and J are the reference's, each world's by its own largest entry; and something touches in many worlds."""
     simulator = Simulator(scene, DT)
     native = NativeStepper(simulator.eager)
-    residual, jacobian = native._core.balance(state, None, native._terms, q)
+    residual, jacobian = native._core.balance(state, None, q)
     objective = simulator.eager.objective(state)
     balance = objective.evaluate(q)
     for ours, theirs in ((residual, balance.residual), (jacobian.flatten(-2), balance.jacobian.flatten(-2))):

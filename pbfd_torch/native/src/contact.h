@@ -11,6 +11,7 @@ template <class V, class N, int D> struct Contacts {
   using M = typename Kind<V>::Mask;
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
+  const Relaxed<V>& relaxed;
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
   V dt;
@@ -22,7 +23,8 @@ template <class V, class N, int D> struct Contacts {
   static int room(Sizes s) {
     return T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
+      : plan(scene), candidates(scene.contact), relaxed(easier) {
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
   }
@@ -45,7 +47,8 @@ template <class V, class N, int D> struct Contacts {
         Touching<V, D> t;
         center(i, now, t.center);
         t.depth = depth(pair, i, now, t.center, t.solid);
-        if (!any(t.depth > V(0))) continue;
+        t.holding = relaxed.holding(i);
+        if (!any((t.depth > V(0)) | (t.holding > V(0)))) continue;
         touch(pair, i, t);
         pbfd::press<Surface, Support>(t, pushes[candidates.carrier[i]]);
       }
@@ -64,6 +67,21 @@ template <class V, class N, int D> struct Contacts {
         const V d = depth(pair, i, now, c, solid);
         for (int j = 0; j < D * D; j++) traced = fma(R[j], R0[j], traced);
         deep = deep | (d > V(candidates.deep[i])), far = far | ((d > V(0)) & (traced < V(D - 2)));
+      }
+    });
+  }
+
+  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) {
+        V c[D], push, rises;
+        Beside<V, D> solid;
+        center(i, before, c);
+        const V start = depth(pair, i, before, c, solid);
+        center(i, at, c);
+        releasing(V(candidates.firmness[i]), depth(pair, i, at, c, solid), start, V(candidates.release[i]) * dt, push, rises);
+        visit(i, push);
       }
     });
   }
@@ -90,8 +108,9 @@ template <class V, class N, int D> struct Contacts {
     for (int j = 0; j < D; j++) t.moved[j] = t.center[j] - c[j];
     Pair::Surface::bend(candidates, i, t.center, t.solid, t.bend);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
-    t.firmness = V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
-    t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt;
+    t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = V(candidates.grip[i]);
+    t.range = V(candidates.release[i]) * dt, t.width = V(candidates.slip_speed[i]) * dt * relaxed.width;
+    t.relaxed = &relaxed;
     if (!Pair::Support::rolls) return;
     V *turn = turned_by + T * k, *rolling = rollings + T * T * k;
     t.turn = turn, t.rolling = rolling;

@@ -1,6 +1,7 @@
 // Loads on degrees of freedom: springs, damping, rotors, dry friction, limits and actuators, as their terms in Python.
 #pragma once
 #include "friction.h"
+#include "relaxed.h"
 #include "release.h"
 #include "tree.h"
 
@@ -11,10 +12,13 @@ template <class V> struct JointStep {
   const V* start;   // [nq] θ_n
   const V* target;  // [nq] where inertia pulls the rotors
   const V* control;  // [nu]
-  V dt, weight;  // [s], κ
+  const V* fitted;   // [nv] θ of springs, damping and actuators
+  V dt, weight;      // [s], κ
+  const Relaxed<V>& relaxed;
 };
 
-enum Loads { SMOOTH = 1, ROUGH = 2, ROTORS = 4, ALL = 7 };  // springs, damping, actuators; limits, dry friction; armatures
+// Springs, damping, actuators; dry friction; limits; both; armatures.
+enum Loads { SMOOTH = 1, DRY = 2, LIMITS = 4, ROUGH = 6, ROTORS = 8, ALL = 15 };
 
 // Balls and free joints, whose coordinates do not add up: ½ c ‖log(q̂⁻¹ q)‖² of springs, damping and rotors. Adds its gradient and
 // its Hessian, each where it is wanted (not null).
@@ -58,7 +62,7 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
       const V x = q[c], moved = x - step.start[c];
       V r(0), slope(0);
       if (LOADS & SMOOTH) {
-        const V share = V(plan.share[i]), taken = fma(share, moved, step.start[c]);
+        const V share = step.fitted[i], taken = fma(share, moved, step.start[c]);
         const V spring = share * V(plan.spring[i]), damping = share * V(plan.damping[i]) * per_dt;
         r = fma(spring, taken - V(plan.rest[c]), damping * moved), slope = fma(spring, share, damping);
       }
@@ -66,17 +70,17 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
         const V rotor = V(plan.armature[i]) * step.weight;
         r = fma(rotor, x - step.target[c], r), slope += rotor;
       }
-      if ((LOADS & ROUGH) && any(plan.dry[i] > N(0))) {
+      if ((LOADS & DRY) && any(plan.dry[i] > N(0))) {
         V factor, falls;
         const V size = abs(moved);
-        slip_factor(size, V(plan.dry_speed[0]) * step.dt, factor, falls);
+        slip_factor(size, V(plan.dry_speed[0]) * step.dt * step.relaxed.width, factor, falls);
         r = fma(V(plan.dry[i]) * factor, moved, r);
         slope = fma(V(plan.dry[i]), fma(falls * size, size, factor), slope);
       }
       const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
-      if ((LOADS & ROUGH) && any((under > zero) | (over > zero))) {
+      if ((LOADS & LIMITS) && any((under > zero) | (over > zero))) {
         V push, rises;
-        const V range = V(plan.limit_release[0]) * step.dt, stiffness = V(plan.limit[i]);
+        const V range = V(plan.limit_release[0]) * step.dt, stiffness = step.relaxed.firmness * V(plan.limit[i]);
         releasing(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), range, push, rises);
         r -= push, slope += rises;
         releasing(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), range, push, rises);
@@ -89,7 +93,7 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
   }
   for (int a = 0; LOADS & SMOOTH && a < plan.nu; a++) {
     const int c = plan.actuated_q[a], i = plan.actuated_v[a];
-    const V share = V(plan.share[i]), gear = V(plan.gear[a]), before = gear * step.start[c], moved = fma(gear, q[c], -before);
+    const V share = step.fitted[i], gear = V(plan.gear[a]), before = gear * step.start[c], moved = fma(gear, q[c], -before);
     const V asked = clamped(step.control[a], V(plan.least_control[a]), V(plan.most_control[a]));
     const V drive = fma(V(plan.gain[a]), asked, V(plan.bias[a])), stiffness = V(plan.stiffness[a]);
     const V falls = fma(share, stiffness, V(plan.resistance[a]) * per_dt);

@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, steepness, sinks, faster, stiffness, mu, range, width, size, along, square, cube, fourth;
+  V depth, start, steepness, sinks, faster, stiffness, mu, holding, range, width, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -23,6 +23,7 @@ template <class V, class N, int D = 3> struct Outlook {
   int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
   V limit_range;
+  const Relaxed<V>* relaxed;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -38,7 +39,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     count = limits = 0, base = slope = zero;
-    limit_range = V(plan.limit_release[0]) * b.dt;
+    limit_range = V(plan.limit_release[0]) * b.dt, relaxed = &b.relaxed;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
@@ -52,7 +53,7 @@ template <class V, class N, int D = 3> struct Outlook {
         const V past = sign * (q[c] - bound), speed = sign * d[i];
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
-        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), V(plan.limit[i])};
+        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), relaxed->firmness * V(plan.limit[i])};
       }
     }
     V known;
@@ -84,12 +85,13 @@ template <class V, class N, int D = 3> struct Outlook {
     for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
     add_swing<D>(t, v, a);
     V sinks = -dot<D>(v, n), faster = -dot<D>(a, n);
-    if (!any((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) & where)) return;
+    at.holding = relaxed->holding(i);
+    if (!any(((at.depth + max(sinks, zero) + V(0.5) * max(faster, zero) > zero) | (at.holding > zero)) & where)) return;
     contacts.touch(pair, i, at);
     Coming<V>& out = coming[count++];
     if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = faster, out.steepness = at.solid.steepness;
-    out.stiffness = at.firmness, out.mu = at.grip, out.range = at.range, out.width = at.width;
+    out.stiffness = at.firmness, out.mu = at.grip, out.holding = at.holding, out.range = at.range, out.width = at.width;
     V u[D], first[D], second[D];
     at.template travel<Surface, Support>(u);
     const V lifted = dot<D>(u, n);
@@ -134,9 +136,11 @@ template <class V, class N, int D = 3> struct Outlook {
     slip_factor(sqrt(max(square, V(0))), c.width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    const V grows = rises * c.steepness * speed, drags = (grows * factor + push * falls * on) * on + push * factor * further;
-    df = grows * speed + push * c.faster + c.mu * drags;
-    return push * speed + c.mu * push * factor * on;
+    V pressed = push, firmer = rises;
+    relaxed->felt(c.holding, pressed, firmer);
+    const V grows = c.steepness * speed, drags = (firmer * grows * factor + pressed * falls * on) * on + pressed * factor * further;
+    df = rises * grows * speed + push * c.faster + c.mu * drags;
+    return push * speed + c.mu * pressed * factor * on;
   }
 
   V of_limit(const Stop<V>& s, V a, V& df) const {
