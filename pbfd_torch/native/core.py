@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -14,17 +15,33 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from pbfd_torch.integrators.energy_momentum import Velocities
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import State
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 
-VECTORS = ("q", "v", "push", "steady", "lag", "average")
-NUMBERS = ("gained", "surplus", "peak")
-COUNTED = ("status", "evaluations", "iterations", "refused", "hazards")
+COUNTED = ("status", "evaluations", "iterations", "hazards")
 ALIGNMENT = 64
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
 BLOCKS = 4  # for each thread: some worlds take longer than others
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """An integrator that the core knows: its function there, and the fields of its states, those of coordinates or of degrees of
+    freedom `[*batch, n]` first, and numbers `[*batch]`."""
+
+    function: str
+    vectors: tuple[str, ...]
+    numbers: tuple[str, ...] = ()
+
+
+SCHEMES: dict[type, Scheme] = {
+    EnergyMomentum: Scheme("pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
+    ImplicitEuler: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
+}
 
 
 class _Plan(ctypes.Structure):
@@ -32,7 +49,7 @@ class _Plan(ctypes.Structure):
         *(
             (name, ctypes.c_int)
             for name in (
-                *("bytes", "dimension", "nodes", "nq", "nv", "nu"),
+                *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
                 *("candidates", "planes", "solids", "samples", "forms", "pushes"),
             )
         ),
@@ -45,19 +62,20 @@ class _Steps(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus")),
         *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
-        ("made", ctypes.c_void_p),
         ("given", ctypes.c_void_p * 9),
         ("control", ctypes.c_void_p),
         ("found", ctypes.c_void_p * 9),
         ("residual_norm", ctypes.c_void_p),
-        ("counted", ctypes.c_void_p * 5),
+        ("counted", ctypes.c_void_p * len(COUNTED)),
+        ("fallbacks", ctypes.c_void_p),
         ("grip", ctypes.c_void_p),
     )
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What steps are asked for. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; evaluations: at most, of each."""
+    """What is asked of steps. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; evaluations: at most, of each with all
+    that is tried."""
 
     dt: float
     tolerance: float
@@ -66,34 +84,33 @@ class Terms:
 
 
 class Journey:
-    """Several steps of all worlds, as far as the core has made them.
+    """Several steps of all worlds.
 
     Attributes:
-        given: the fields of the state `[*batch, ...]` that each world goes on from.
+        given: the fields of the state `[*batch, ...]` that each world sets out from.
         control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
         fields: of the state after each step, `[steps, *batch, ...]`.
         residual_norm, counted, fallbacks: how each was solved, `[steps, *batch, ...]`.
-        made: `[*batch]`, how many of its steps each world has made; the next one stopped it, and its end is there.
     """
 
-    def __init__(self, state: Velocities, control: Tensor, steps: int, grip: Tensor | None) -> None:
-        batch, self.steps = tuple(state.q.shape[:-1]), steps
-        self.given = {name: _whole(getattr(state, name), (*batch, getattr(state, name).shape[-1])) for name in VECTORS}
-        self.given |= {name: _whole(getattr(state, name), batch) for name in NUMBERS}
+    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: int, grip: Tensor | None) -> None:
+        batch = tuple(state.q.shape[:-1])
+        self.given = {name: _whole(getattr(state, name), (*batch, getattr(state, name).shape[-1])) for name in scheme.vectors}
+        self.given |= {name: _whole(getattr(state, name), batch) for name in scheme.numbers}
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
         self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
         self.fields = {name: x.new_empty((steps, *x.shape)) for name, x in self.given.items()}
         self.residual_norm = state.q.new_empty((steps, *batch))
         self.counted = {name: torch.empty((steps, *batch), dtype=torch.int32) for name in COUNTED}
-        self.fallbacks = torch.zeros((steps, *batch, len(FALLBACKS)), dtype=torch.int32)
-        self.made = torch.zeros(batch, dtype=torch.int32)
+        self.fallbacks = torch.empty((steps, *batch, len(FALLBACKS)), dtype=torch.int32)
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
-        held = len(self.control) == 1
-        asked = _Steps(*dataclasses.astuple(terms), self.made.numel(), 0, self.made.numel(), self.steps, held)
-        asked.made, asked.control = self.made.data_ptr(), self.control.data_ptr()
-        asked.residual_norm = self.residual_norm.data_ptr()
+        steps, *batch = self.residual_norm.shape
+        worlds = math.prod(batch)
+        asked = _Steps(*dataclasses.astuple(terms), worlds, 0, worlds, steps, len(self.control) == 1)
+        asked.control, asked.residual_norm = self.control.data_ptr(), self.residual_norm.data_ptr()
+        asked.fallbacks = self.fallbacks.data_ptr()
         if self.grip is not None:
             asked.grip = self.grip.data_ptr()
         for array, values in ((asked.given, self.given), (asked.found, self.fields), (asked.counted, self.counted)):
@@ -102,24 +119,19 @@ class Journey:
         return asked
 
     @property
-    def stopped(self) -> Tensor:
-        """Positions in the flattened batch of the worlds that have steps to make yet."""
-        return (self.made.reshape(-1) < self.steps).nonzero().squeeze(-1)
-
-    @property
     def solution(self) -> Solution:
         """How the steps were solved, `[steps, *batch, ...]`."""
-        counted = {name: x for name, x in self.counted.items() if name not in ("refused", "hazards")}
+        counted = {name: x for name, x in self.counted.items() if name != "hazards"}
         lanes = int(counted["evaluations"].sum())
         return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
 
 
 class Core:
-    """A scene's plan in the compiled library. `threads`: at most, of those that share a call's worlds. Raises `ValueError` where
-    both do not fit together."""
+    """A scene's plan and a scheme's steps in the compiled library. `threads`: at most, of those that share a call's worlds. Raises
+    `ValueError` where library and plan do not fit together."""
 
-    def __init__(self, library: Library, plan: Plan, threads: int) -> None:
-        self.plan, self._threads = plan, threads
+    def __init__(self, library: Library, plan: Plan, scheme: Scheme, terms: Terms, threads: int) -> None:
+        self.plan, self._scheme, self._terms, self._threads = plan, scheme, terms, threads
         self._functions = library.functions
         self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
@@ -132,24 +144,26 @@ class Core:
     def _asked(self, name: str) -> int:
         return int(getattr(self._functions, name)(ctypes.byref(self._plan)))
 
-    def go(self, journey: Journey, terms: Terms) -> None:
-        """Makes the steps of a journey as far as every world comes, on several threads where that is worth it: worlds do not know
-        of each other, and it makes no difference to any."""
-        asked = journey.call(terms)
-        blocks = min(BLOCKS * self._threads, asked.worlds * asked.steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
+    def go(self, state: State, control: Tensor, steps: int) -> Journey:
+        """So many steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On
+        several threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
+        journey = Journey(self._scheme, state, control, steps, self.plan.grip)
+        asked = journey.call(self._terms)
+        blocks = min(BLOCKS * self._threads, asked.worlds * steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
         if self._threads == 1 or blocks < 2:
             self._make(asked)
-            return
+            return journey
         calls = []
         for first, last in _blocks(asked.worlds, blocks, self._lanes):
             part = _Steps.from_buffer_copy(asked)
             part.first, part.last = first, last
             calls.append(part)
         list(_pool(self._threads).map(self._make, calls))
+        return journey
 
     def _make(self, asked: _Steps) -> None:
         with self._room() as room:
-            self._functions.pbfd_energy_momentum(ctypes.byref(self._plan), ctypes.byref(asked), room)
+            getattr(self._functions, self._scheme.function)(ctypes.byref(self._plan), ctypes.byref(asked), room)
 
     @contextmanager
     def _room(self) -> Iterator[ctypes.c_void_p]:
@@ -161,15 +175,16 @@ class Core:
         yield ctypes.c_void_p(-(-room.data_ptr() // ALIGNMENT) * ALIGNMENT)
         self._rooms.append(room)
 
-    def balance(self, state: Velocities, control: Tensor | None, terms: Terms, q: Tensor) -> tuple[Tensor, Tensor]:
-        """The balance of forces of the step from a state at q `[*batch, nq]`: r `[*batch, nv]` and J `[*batch, nv, nv]`."""
+    def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
+        """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and
+        J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(state, held, 1, self.plan.grip)
+        journey = Journey(self._scheme, state, held, 1, self.plan.grip)
         at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         with self._room() as room:
-            self._functions.pbfd_balance(ctypes.byref(self._plan), ctypes.byref(journey.call(terms)), *addresses, room)
+            self._functions.pbfd_balance(ctypes.byref(self._plan), ctypes.byref(journey.call(self._terms)), *addresses, room)
         return residual, jacobian
 
 

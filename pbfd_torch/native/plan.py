@@ -11,11 +11,13 @@ from torch import Tensor
 
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import Candidates, on_nodes
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.stepper import SHORTEST_STEP
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -33,7 +35,7 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
+    """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
     dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ."""
 
     sizes: tuple[int, ...]
@@ -66,10 +68,11 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         driven = [act.gear, act.gain, act.bias, act.stiffness, act.damping, *ranges]
     whole += candidates.whole() + known.pushed
     scale = force_scale(a, 1.0).expand(t.nv)
+    shares = _shares(stepper, known.share)
     speeds = [known.limit_release, known.limit_per_force, known.dry_speed]
     real = [
         *nodes,
-        *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), known.share, known.spring, known.damping, known.armature),
+        *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), *shares, known.spring, known.damping, known.armature),
         *(known.dry, a.lower, a.upper, known.limit, known.rest),
         *driven,
         *(gravity, reach(a), a.rest.new_tensor(speeds)),
@@ -77,7 +80,7 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         *(x[k] for k in range(2) for x in known.pushes),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    sizes = (t.njoint, t.nq, t.nv, nu, *candidates.sizes, len(known.pushed))
+    sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
     return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2, candidates.grip)
 
 
@@ -86,10 +89,12 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     a, scene = stepper.articulation, stepper.scene
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
-    if type(stepper.integrator) is not EnergyMomentum:
+    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler):
         raise unknown(f"integrator {type(stepper.integrator).__name__}")
     if stepper.step_size.ndim:
         raise unknown("a step of its own for each world")
+    if not isinstance(stepper.evaluations, int):
+        raise unknown("evaluations of its own for each world")
     for what in ("joint_frame", "joint_axis", "joint_ref", "link_frame", "pseudo_inertia", "lower", "upper"):
         if getattr(a, what).ndim != {"joint_ref": 1, "lower": 1, "upper": 1, "joint_axis": 2}.get(what, 3):
             raise unknown(f"{what} of its own for each world")
@@ -99,6 +104,18 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     eye = torch.eye(4, dtype=a.dtype)
     if any(not torch.equal(a.joint_frame[j], eye) for j in free):
         raise unknown("a free joint that does not move along the world's axes")
+
+
+def _shares(stepper: EagerStepper[Any], share: Tensor) -> list[Tensor]:
+    """θ of the smooth loads on joints in the whole step, where it is `share`, and in steps ½, ¼, … as long: as many as its halvings
+    may make."""
+    shares = [share]
+    for times in range(1, stepper.halvings + 1):
+        if stepper.dt / 2**times < SHORTEST_STEP:
+            break
+        terms = stepper.integrator.adapted(stepper.articulation, stepper.scene.terms, stepper.step_size / 2**times)
+        shares.append(next((term.share for term in terms if isinstance(term, Fitted)), share))
+    return shares
 
 
 def _plain(frames: Tensor) -> list[int]:
@@ -142,7 +159,7 @@ class _Terms:
 
     def __init__(self, stepper: EagerStepper[Any], a: Articulation) -> None:
         zero = torch.zeros(a.nv, dtype=a.dtype)
-        self.share = zero + 0.5
+        self.share = zero + (0.5 if isinstance(stepper.integrator, EnergyMomentum) else 1.0)
         self.spring = self.damping = self.armature = self.dry = self.limit = zero
         self.rest = a.rest
         self.limit_release, self.limit_per_force, self.dry_speed = 1.0, 0.0, 1e-3

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pbfd_torch.integrators.energy_momentum import Velocities
+from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.stepper import NativeStepper, spread
 from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
@@ -17,8 +17,8 @@ AT_ONCE = 4096  # steps of worlds: what is recorded in one go is in the processo
 
 
 def rolled_out(
-    stepper: NativeStepper,
-    state: Velocities,
+    stepper: NativeStepper[S],
+    state: S,
     controls: Tensor | None = None,
     steps: int | None = None,
     progress: Callable[[int], object] | None = None,

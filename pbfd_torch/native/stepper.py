@@ -1,51 +1,54 @@
-"""Steps by the compiled core. What it leaves unsolved or refuses is led on in PyTorch, by the same detours and easier steps."""
+"""Steps by the compiled core."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Generic
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
-from pbfd_torch.native.core import Core, Journey, Terms
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.integrators.implicit_euler import Positions
+from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.native.core import SCHEMES, Core, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError
 from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.scene import Scene
-from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.solvers.per_world import chosen, mapped
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
-class NativeStepper:
-    """A `Stepper` whose steps the compiled core makes, of what an `EagerStepper` is made of. `threads`: at most, for batches that
-    are worth it; None: as many as PyTorch uses. Raises `InputError` where there is no core, and for a scene that it does not know,
-    naming what it lacks (`uncovered`)."""
+class NativeStepper(Generic[S]):
+    """A `Stepper` whose steps the compiled core makes, with all their fallbacks, of what an `EagerStepper` is made of. `threads`:
+    at most, for batches that are worth it; None: as many as PyTorch uses. Raises `InputError` where there is no core, and for a
+    scene that it does not know, naming what it lacks (`uncovered`)."""
 
-    def __init__(self, eager: EagerStepper[Velocities], threads: int | None = None) -> None:
+    def __init__(self, eager: EagerStepper[S], threads: int | None = None) -> None:
         try:
             plan = _planned(eager)
         except NotCompiledError as missing:
             raise InputError(f"no compiled steps: {missing}") from missing
         compiled = library()
         assert compiled is not None
+        assert isinstance(eager.evaluations, int)
         self.eager = eager
         self.threads = threads or torch.get_num_threads()
-        self._core = Core(compiled, plan, self.threads)
-        direct = eager.first_solver
-        assert isinstance(direct, Descent)
-        tolerance = direct.tolerance_for(eager.articulation.dtype)
-        self._terms = Terms(eager.dt, tolerance, self.integrator.surplus, direct.max_evaluations)
+        scheme: object = eager.integrator
+        surplus = scheme.surplus if isinstance(scheme, EnergyMomentum) else math.inf
+        tolerance = Fallbacks().direct.tolerance_for(eager.articulation.dtype)
+        terms = Terms(eager.dt, tolerance, surplus, eager.evaluations)
+        self._core = Core(compiled, plan, SCHEMES[type(scheme)], terms, self.threads)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads the core itself."""
@@ -57,11 +60,9 @@ class NativeStepper:
         return self.eager.scene
 
     @property
-    def integrator(self) -> EnergyMomentum:
+    def integrator(self) -> Integrator[S]:
         """See `Stepper`."""
-        scheme = self.eager.integrator
-        assert isinstance(scheme, EnergyMomentum)
-        return scheme
+        return self.eager.integrator
 
     @property
     def step_size(self) -> Tensor:
@@ -83,17 +84,17 @@ class NativeStepper:
         """See `Stepper`."""
         return self.eager.halvings
 
-    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> Velocities:
+    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
         """See `Stepper`: in PyTorch."""
         return self.eager.initial_state(q, v, control)
 
-    def made(self, state: Velocities, control: Tensor | None) -> tuple[Velocities, Solution, Way]:
+    def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
         states, solution = self.run(state, None if control is None else control[None], 1)
         after, solution = mapped(_first, states), dataclasses.replace(mapped(_first, solution), lanes=solution.lanes)
         return after, solution, Way(solution.q)
 
-    def run(self, state: Velocities, controls: Tensor | None, steps: int) -> tuple[Velocities, Solution]:
+    def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
         after each, `[steps, *batch, ...]`, and how each was solved."""
         batch = state.q.shape[:-1]
@@ -103,57 +104,27 @@ class NativeStepper:
             controls = state.q.new_zeros(1, self.scene.nu)
         controls = spread(controls, batch)
         with torch.no_grad():
-            journey = Journey(state, controls, steps, self._core.plan.grip)
-            self._core.go(journey, self._terms)
-            while len(journey.stopped):
-                self._lead_on(journey, state)
-                self._core.go(journey, self._terms)
+            journey = self._core.go(self._complete(state), controls, steps)
             time = torch.cat((state.time[None], self.step_size.expand(steps, *batch))).cumsum(0)[1:]
             fields = journey.fields | {"time": time, "hazards": journey.counted["hazards"]}
             remembered = tuple(x.expand(steps, *x.shape) for x in state.memory)  # by terms that the core does not know
             return replaced(state, **fields, memory=remembered), journey.solution
 
-    def _lead_on(self, journey: Journey, state: Velocities) -> None:
-        """The next step of every stopped world, by what the eager step does after its first solver."""
-        worlds = Worlds(tuple(state.q.shape[:-1]), journey.stopped)
-        step = worlds.rows(journey.made).long()
+    def _complete(self, state: S) -> S:
+        """With zero for an acceleration that is not known."""
+        if not isinstance(state, Positions) or state.acceleration is not None:
+            return state
+        return replaced(state, acceleration=state.q.new_zeros(*state.q.shape[:-1], self.scene.articulation.nv))
 
-        def row(values: Tensor, at: Tensor) -> Tensor:
-            return values.flatten(1, len(worlds.batch))[at, worlds.index]
-
-        def write(values: Tensor, new: Tensor) -> None:
-            values.flatten(1, len(worlds.batch))[step, worlds.index] = new.to(values.dtype)
-
-        before = state.take(worlds)
-        ends = {name: row(x, (step - 1).clamp(min=0)) for name, x in journey.fields.items()}
-        before = replaced(before, **{name: chosen(step > 0, x, getattr(before, name)) for name, x in ends.items()})
-        control = row(journey.control, step if len(journey.control) > 1 else torch.zeros_like(step))
-        left = mapped(lambda x: row(x, step), journey.solution)
-        advanced = replaced(before, **{name: row(x, step) for name, x in journey.fields.items()})
-        part = self.eager.take(worlds)
-        objective = part.objective(before, control)
-        refused = row(journey.counted["refused"], step).to(torch.bool)
-        end, found, _ = part.finished(objective, before, control, left, advanced, refused)
-        end, found = part.arrived(before, end, found)
-        for name, values in (journey.counted | {"residual_norm": journey.residual_norm, "fallbacks": journey.fallbacks}).items():
-            if name != "refused":
-                write(values, end.hazards if name == "hazards" else getattr(found, name))
-        for name, values in journey.fields.items():
-            write(values, getattr(end, name))
-            given = journey.given[name].clone()  # it may be the caller's
-            given.view(-1, *given.shape[len(worlds.batch) :])[worlds.index] = getattr(end, name)
-            journey.given[name] = given
-        journey.made.view(-1)[worlds.index] += 1
-
-    def objective(self, state: Velocities, control: Tensor | None) -> BalanceObjective:
+    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
         """See `Stepper`."""
         return self.eager.objective(state, control)
 
-    def take(self, worlds: Worlds) -> NativeStepper:
+    def take(self, worlds: Worlds) -> NativeStepper[S]:
         """See `Stepper`."""
         return NativeStepper(self.eager.take(worlds), self.threads)
 
-    def sized(self, step_size: Tensor) -> NativeStepper:
+    def sized(self, step_size: Tensor) -> NativeStepper[S]:
         """See `Stepper`."""
         return NativeStepper(self.eager.sized(step_size), self.threads)
 
@@ -171,7 +142,7 @@ def _planned(eager: EagerStepper[Any]) -> Plan:
     """Raises `NotCompiledError`."""
     if library() is None:
         raise NotCompiledError(reason())
-    if not isinstance(eager.solver, Fallbacks) or eager.solver.direct != Fallbacks().direct:
+    if eager.solver != Fallbacks():
         raise NotCompiledError("the core does not know a solver other than the default one")
     return planned(eager)
 

@@ -18,8 +18,10 @@ template <class V, class N, int D = 3> struct Balance {
   const Plan<N, D>& plan;
   // what is fixed in a step
   Poses<V> start, target;
-  V *start_axes, *q_start, *q_target, *control, *limits;
+  V *start_axes, *q_start, *q_target, *control, *limits, *fitted;
   V dt, weight, share;  // share = 1: inertia works at the end of the step
+  V inert;                  // κ over the square of the length that inertia knows of
+  Relaxed<V> relaxed;
   Hold<V, D>* holds;
   V* arms;  // κ Σ m p̃ of all that a node moves
   // at the configuration
@@ -32,29 +34,35 @@ template <class V, class N, int D = 3> struct Balance {
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 3 + s.nv) * s.nv;
+           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 4 + s.nv) * s.nv +
+           s.candidates;
   }
   template <class X> static X* taken(Arena<V>& arena, int count) {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
   }
 
-  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, arena) {
+  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, relaxed, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes), limits = arena.take(plan.nv);
+    fitted = arena.take(plan.nv), relaxed.held = arena.take(plan.candidates);
+    relaxed.none();
+    limits = arena.take(plan.nv), arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
     pushes = taken<Push<V, D>>(arena, plan.nodes);
     for (int i = 0; i < plan.nv * plan.nv; i++) matrix[i] = V(0);  // dofs on different branches stay uncoupled
   }
 
-  // The start and its axes, the target, κ and w are known.
+  // The start and its axes, the target, κ, w and what is relaxed are known.
   void begin() {
+    inert = weight / (relaxed.length * relaxed.length);
     for (int k = 0; k < plan.nodes; k++)
-      if (heavy(k)) hold(plan, k, weight, share, start, target, holds[k]);
+      if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
+    stiffen_limits(plan, steps(), limits);
+    contacts.begin(start, target, dt);
   }
 
   // r at q; J by `assemble`.
@@ -85,7 +93,7 @@ template <class V, class N, int D = 3> struct Balance {
     for (int k = 0; k < plan.nodes; k++) {
       const Pull<V, D>& pull = pulls[k];
       const Push<V, D>& push = pushes[k];
-      const V mass = weight * V(plan.carried[k]), *arm = arms + D * k;
+      const V mass = inert * V(plan.carried[k]), *arm = arms + D * k;
       const int first = plan.v[k], last = first + freedoms(plan.kind[k]);
       for (int i = first; i < last; i++)
         for (int j = first; j < last; j++) matrix[plan.nv * i + j] = i == j ? slopes[j] : V(0);
@@ -141,7 +149,7 @@ template <class V, class N, int D = 3> struct Balance {
     if (!curved) let_go(target);
   }
 
-  JointStep<V> steps() const { return {q_start, q_target, control, limits, dt, weight}; }
+  JointStep<V> steps() const { return {q_start, q_target, control, limits, fitted, dt, inert, relaxed}; }
 
  private:
   bool heavy(int k) const { return any(plan.mass[k] > N(0)); }
@@ -150,7 +158,7 @@ template <class V, class N, int D = 3> struct Balance {
   // Masses are held at places between the start and `other`.
   void let_go(Poses<V> other) {
     for (int k = 0; k < plan.nodes; k++)
-      if (heavy(k)) hold_by(plan, k, weight, share, start, other, holds[k]);
+      if (heavy(k)) hold_by(plan, k, inert, share, start, other, holds[k]);
     carry();
   }
   void carry() {
@@ -163,7 +171,7 @@ template <class V, class N, int D = 3> struct Balance {
   void pull_all() {
     for (int k = 0; k < plan.nodes; k++) {
       pulls[k].any = heavy(k);  // a joint may only lead to others
-      if (heavy(k)) pull(plan, k, weight, share, holds[k], now, pulls[k]);
+      if (heavy(k)) pull(plan, k, inert, share, holds[k], now, pulls[k]);
     }
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) pulls[plan.parent[k]].add(pulls[k]);

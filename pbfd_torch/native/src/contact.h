@@ -14,6 +14,7 @@ template <class V, class N, int D> struct Contacts {
   // of the worlds in the lanes
   const Scalar* own_grip = nullptr;  // [worlds, candidates], where worlds differ
   V* grip;                           // μ [candidates]
+  const Relaxed<V>& relaxed;
   // what is fixed in a step
   Poses<V> before;  // of the nodes at its start
   V per_dt;
@@ -27,7 +28,8 @@ template <class V, class N, int D> struct Contacts {
   static int room(Sizes s) {
     return (4 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), candidates(scene.contact) {
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
+      : plan(scene), candidates(scene.contact), relaxed(easier) {
     grip = arena.take(plan.candidates), share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
@@ -74,7 +76,8 @@ template <class V, class N, int D> struct Contacts {
         Touching<V, D> t;
         center(i, now, t.center);
         t.depth = depth(pair, i, now, t.center, t.solid);
-        if (!any(t.depth > V(0))) continue;
+        t.holding = relaxed.holding(i);
+        if (!any((t.depth > V(0)) | (t.holding > V(0)))) continue;
         touch(pair, i, t);
         pbfd::press<Surface::flat, Support>(t, pushes[candidates.carrier[i]]);
       }
@@ -93,6 +96,23 @@ template <class V, class N, int D> struct Contacts {
         const V d = depth(pair, i, now, c, solid);
         for (int j = 0; j < D * D; j++) traced = fma(R[j], R0[j], traced);
         deep = deep | (d > V(candidates.deep[i])), far = far | ((d > V(0)) & (traced < V(D - 2)));
+      }
+    });
+  }
+
+  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) {
+        V c[D], push, rises;
+        Beside<V, D> solid;
+        center(i, before, c);
+        const V start = depth(pair, i, before, c, solid);
+        center(i, at, c);
+        V firmness = V(candidates.firmness[i]);
+        if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
+        release_law(firmness, depth(pair, i, at, c, solid), start, per_dt * V(N(1) / candidates.release[i]), push, rises);
+        visit(i, push);
       }
     });
   }
@@ -127,8 +147,10 @@ template <class V, class N, int D> struct Contacts {
     if constexpr (Pair::Surface::convex)
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
-    t.firmness = V(candidates.firmness[i]), t.grip = grip[i];
-    t.per_range = per_dt * V(N(1) / candidates.release[i]), t.per_width = per_dt * V(N(1) / candidates.slip_speed[i]);
+    t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
+    t.per_range = per_dt * V(N(1) / candidates.release[i]);
+    t.per_width = per_dt * V(N(1) / candidates.slip_speed[i]) / relaxed.width;
+    t.relaxed = &relaxed;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
     if (!turned[k]) turn(k);

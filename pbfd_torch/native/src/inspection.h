@@ -10,10 +10,12 @@ inline void inspect(const Plan<T, D>& plan, const T* grip, const T* q, const T* 
                     T* matrix) {
   Balance<T, T, D> balance(plan, arena);
   T* room = arena.take(18 * plan.nodes);
-  balance.dt = dt, balance.contacts.own_grip = grip;
+  balance.dt = dt, balance.share = T(0.5), balance.contacts.own_grip = grip;
   balance.contacts.load(0, 0);
+  for (int j = 0; j < plan.nv; j++) balance.fitted[j] = plan.share[j];
   for (int j = 0; j < plan.nu; j++) balance.control[j] = control[j];
   begin_energy_momentum(balance, q, v, room);
+  balance.begin();
   balance.evaluate(at), balance.assemble(at, true);
   for (int j = 0; j < plan.nv; j++) residual[j] = balance.residual[j];
   for (int j = 0; j < plan.nv * plan.nv; j++) matrix[j] = balance.matrix[j];

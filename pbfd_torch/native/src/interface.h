@@ -14,29 +14,28 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
-  int bytes, dimension, nodes, nq, nv, nu, candidates, planes, solids, samples, forms, pushes;
+  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, planes, solids, samples, forms, pushes;
   const int* whole;
   const void* real;
 };
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
-//   given: q, v, push, steady, lag, average, gained, surplus, peak of the state (`Velocities`) that each world goes on from;
+//   given: of the state that each world goes on from: q, v, push, steady, lag, average, gained, surplus, peak (`Velocities`), or q,
+//     q_previous, acceleration (`Positions`);
 //   control: [worlds, nu] for all steps if `held`, else [steps, worlds, nu];
-//   made: [worlds], how many of its steps each world has made: it goes on with the next one, and stops before one that is not solved
-//     or is refused;
-//   found: what is given, after each step [steps, …], that which stopped a world included;
-//   residual_norm, counted (status, evaluations, iterations, refused, hazards): [steps, worlds].
+//   found: what is given, after each step, [steps, …];
+//   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].
 struct pbfd_steps {
   double dt, tolerance, surplus;
-  int evaluations;  // at most, of each world in each step
+  int evaluations;  // at most, of each world in each step, with all that is tried
   int worlds, first, last;
   int steps, held;
-  int* made;
   const void* given[9];
   const void* control;
   void* found[9];
   void* residual_norm;
-  int* counted[5];
+  int* counted[4];
+  int* fallbacks;
   const void* grip;  // μ of the candidates, [worlds, candidates]; null: the plan's
 };
 
@@ -45,9 +44,10 @@ PBFD_FUNCTION long pbfd_whole_numbers(const pbfd_plan*);
 PBFD_FUNCTION long pbfd_real_numbers(const pbfd_plan*);
 PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 
-// Energy–momentum steps by Newton's method from the guess or from θ_n.
+// Steps by Newton's method with all fallbacks.
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
+PBFD_FUNCTION void pbfd_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
 
-// The balance of forces that steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
+// The balance of forces that energy–momentum steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
 // J [worlds, nv · nv].
 PBFD_FUNCTION void pbfd_balance(const pbfd_plan*, const pbfd_steps*, const void* q, void* residual, void* jacobian, void* room);

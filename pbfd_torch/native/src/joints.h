@@ -1,6 +1,7 @@
 // Loads on degrees of freedom: springs, damping, rotors, dry friction, limits and actuators, as their terms in Python.
 #pragma once
 #include "friction.h"
+#include "relaxed.h"
 #include "release.h"
 #include "tree.h"
 
@@ -12,7 +13,9 @@ template <class V> struct JointStep {
   const V* target;  // [nq] where inertia pulls the rotors
   const V* control;  // [nu]
   const V* limits;   // [nv] how stiff they are
-  V dt, weight;  // [s], κ
+  const V* fitted;   // [nv] θ of springs, damping and actuators
+  V dt, weight;      // [s], κ
+  const Relaxed<V>& relaxed;
 };
 
 // How stiff the limits are in a step: at least so that they hold what its actuators press with where it begins.
@@ -26,7 +29,8 @@ template <class V, class N, int D> inline void stiffen_limits(const Plan<N, D>& 
   for (int i = 0; i < plan.nv; i++) out[i] = max(V(plan.limit[i]), V(plan.limit_per_force[0]) * abs(out[i]));
 }
 
-enum Loads { SMOOTH = 1, ROUGH = 2, ROTORS = 4, ALL = 7 };  // springs, damping, actuators; limits, dry friction; armatures
+// Springs, damping, actuators; dry friction; limits; both; armatures.
+enum Loads { SMOOTH = 1, DRY = 2, LIMITS = 4, ROUGH = 6, ROTORS = 8, ALL = 15 };
 
 // Balls and free joints, whose coordinates do not add up: ½ c ‖log(q̂⁻¹ q)‖² of springs, damping and rotors. Adds its gradient and
 // its Hessian, each where it is wanted (not null).
@@ -70,7 +74,7 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
       const V x = q[c], moved = x - step.start[c];
       V r(0), slope(0);
       if (LOADS & SMOOTH) {
-        const V share = V(plan.share[i]), taken = fma(share, moved, step.start[c]);
+        const V share = step.fitted[i], taken = fma(share, moved, step.start[c]);
         const V spring = share * V(plan.spring[i]), damping = share * V(plan.damping[i]) * per_dt;
         r = fma(spring, taken - V(plan.rest[c]), damping * moved), slope = fma(spring, share, damping);
       }
@@ -78,17 +82,17 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
         const V rotor = V(plan.armature[i]) * step.weight;
         r = fma(rotor, x - step.target[c], r), slope += rotor;
       }
-      if ((LOADS & ROUGH) && any(plan.dry[i] > N(0))) {
+      if ((LOADS & DRY) && any(plan.dry[i] > N(0))) {
         V factor, falls;
         const V size = abs(moved);
-        slip_law(size, V(1) / (V(plan.dry_speed[0]) * step.dt), factor, falls);
+        slip_law(size, V(1) / (V(plan.dry_speed[0]) * step.dt * step.relaxed.width), factor, falls);
         r = fma(V(plan.dry[i]) * factor, moved, r);
         slope = fma(V(plan.dry[i]), fma(falls * size, size, factor), slope);
       }
       const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
-      if ((LOADS & ROUGH) && any((under > zero) | (over > zero))) {
+      if ((LOADS & LIMITS) && any((under > zero) | (over > zero))) {
         V push, rises;
-        const V per_range = V(1) / (V(plan.limit_release[0]) * step.dt), stiffness = step.limits[i];
+        const V per_range = V(1) / (V(plan.limit_release[0]) * step.dt), stiffness = step.relaxed.firmness * step.limits[i];
         release_law(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), per_range, push, rises);
         r -= push, slope += rises;
         release_law(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), per_range, push, rises);
@@ -101,7 +105,7 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
   }
   for (int a = 0; LOADS & SMOOTH && a < plan.nu; a++) {
     const int c = plan.actuated_q[a], i = plan.actuated_v[a];
-    const V share = V(plan.share[i]), gear = V(plan.gear[a]), before = gear * step.start[c], moved = fma(gear, q[c], -before);
+    const V share = step.fitted[i], gear = V(plan.gear[a]), before = gear * step.start[c], moved = fma(gear, q[c], -before);
     const V asked = clamped(step.control[a], V(plan.least_control[a]), V(plan.most_control[a]));
     const V drive = fma(V(plan.gain[a]), asked, V(plan.bias[a])), stiffness = V(plan.stiffness[a]);
     const V falls = fma(share, stiffness, V(plan.resistance[a]) * per_dt);

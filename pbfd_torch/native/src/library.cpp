@@ -7,7 +7,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 3; }
+int pbfd_interface() { return 4; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -16,24 +16,19 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  return {{p->candidates, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->pushes};
+  return {{p->candidates, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
 }
 
-template <class V, int D> void energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <template <class, class, int> class Scheme, class V, int D>
+void make(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   using T = typename Kind<V>::Scalar;
   Arena<V> arena{static_cast<V*>(room)};
   const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
-  Machine<V, T, D> machine(plan, arena);
-  auto given = [&](int i) { return static_cast<const T*>(s->given[i]); };
-  auto found = [&](int i) { return static_cast<T*>(s->found[i]); };
-  const Journey<T> journey{
-      s->worlds, s->steps, s->held != 0, s->made,
-      given(0), given(1), given(2), given(3), given(4), given(5), given(6), given(7), given(8), static_cast<const T*>(s->control),
-      found(0), found(1), found(2), found(3), found(4), found(5), found(6), found(7), found(8), static_cast<T*>(s->residual_norm),
-      s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->counted[4]};
+  Machine<V, T, D, Scheme<V, T, D>> machine(plan, arena);
   machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
-  machine.scheme.surplus_allowed = V(T(s->surplus));
-  machine.run(journey, s->first, s->last, T(s->dt), T(s->tolerance), s->evaluations);
+  const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
+                           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
+  machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, p->halvings, s->evaluations}, s->first, s->last);
 }
 
 template <class T, int D>
@@ -47,11 +42,26 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <class T, int D> void energy_momentum_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <template <class, class, int> class Scheme, class T, int D> void make_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   if (s->last - s->first == 1)
-    energy_momentum<T, D>(p, s, room);
+    make<Scheme, T, D>(p, s, room);
   else
-    energy_momentum<Lanes<T, register_bytes / int(sizeof(T))>, D>(p, s, room);
+    make<Scheme, Lanes<T, register_bytes / int(sizeof(T))>, D>(p, s, room);
+}
+
+template <template <class, class, int> class Scheme> void make_by(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  const bool plane = p->dimension == 2;
+  if (p->bytes == 8)
+    plane ? make_of<Scheme, double, 2>(p, s, room) : make_of<Scheme, double, 3>(p, s, room);
+  else
+    plane ? make_of<Scheme, float, 2>(p, s, room) : make_of<Scheme, float, 3>(p, s, room);
+}
+
+// Room for lanes V, in V; a plane needs less.
+template <class V> int room_of(Sizes s) {
+  using T = typename Kind<V>::Scalar;
+  const int one = Machine<V, T, 3, EnergyMomentum<V, T, 3>>::room(s), other = Machine<V, T, 3, ImplicitEuler<V, T, 3>>::room(s);
+  return one > other ? one : other;
 }
 
 }  // namespace
@@ -66,18 +76,15 @@ long pbfd_real_numbers(const pbfd_plan* p) {
 
 long pbfd_room(const pbfd_plan* p) {
   // lanes of either scalar fill one register, and need the same number of them but for what is counted in bytes
-  const int wide = Machine<Lanes<double, register_bytes / 8>, double>::room(sizes(p));
-  const int narrow = Machine<Lanes<float, register_bytes / 4>, float>::room(sizes(p));
+  using Wide = Lanes<double, register_bytes / 8>;
+  using Narrow = Lanes<float, register_bytes / 4>;
+  const int wide = room_of<Wide>(sizes(p)), narrow = room_of<Narrow>(sizes(p));
   return long(register_bytes) * (wide > narrow ? wide : narrow);
 }
 
-void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  const bool plane = p->dimension == 2;
-  if (p->bytes == 8)
-    plane ? energy_momentum_of<double, 2>(p, s, room) : energy_momentum_of<double, 3>(p, s, room);
-  else
-    plane ? energy_momentum_of<float, 2>(p, s, room) : energy_momentum_of<float, 3>(p, s, room);
-}
+void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<EnergyMomentum>(p, s, room); }
+
+void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<ImplicitEuler>(p, s, room); }
 
 void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   const bool plane = p->dimension == 2;

@@ -1,7 +1,9 @@
-// The lane machine: every pass makes one evaluation for all lanes, and a lane that has ended its step takes the next one of its world,
-// or another world, at once (the paper's Fig. 3).
+// The lane machine: every pass makes one evaluation for all lanes, each at its own place of its own step, with all that it tries, and
+// a lane that has ended its step takes the next one of its world, or another world, at once (the paper's Fig. 3).
 #pragma once
 #include "energy_momentum.h"
+#include "implicit_euler.h"
+#include "itinerary.h"
 #include "standstill.h"
 
 namespace pbfd {
@@ -13,41 +15,43 @@ constexpr double TOO_FAR = 0.02;  // [rad or m] past a limit
 template <class T> struct Journey {
   int worlds, steps;
   bool held;
-  int* made;
-  const T *q, *v, *push, *steady, *lag, *average, *gained, *surplus, *peak, *control;
-  T *q_out, *v_out, *push_out, *steady_out, *lag_out, *average_out, *gained_out, *surplus_out, *peak_out;
+  const void* const* given;
+  const T* control;
+  void* const* found;
   T* residual_norm;
-  int *status, *evaluations, *iterations, *refused, *hazards;
+  int *status, *evaluations, *iterations, *hazards, *fallbacks;
 };
 
-template <class V, class N, int D = 3> struct Machine {
+template <class V, class N, int D, class Scheme> struct Machine {
   using T = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
+  using State = typename Scheme::State;
   static constexpr int W = Kind<V>::lanes;
 
   const Plan<N, D>& plan;
   Newton<V, N, D> newton;
-  EnergyMomentum<V, N, D> scheme;
-  Velocities<V> before, after;
-  V *q, *guess, *velocity, *room_to_begin;
+  Sight<V, N, D> sight;
+  Scheme scheme;
+  State before, after, origin, best;  // of the attempt; of the whole step
+  V *guess, *from, *found, *velocity;
 
   static int room(Sizes s) {
-    return Newton<V, N, D>::room(s) + EnergyMomentum<V, N, D>::room(s) + 11 * s.nv + 2 * s.nq + 18 * s.nodes;
+    return Newton<V, N, D>::room(s) + Sight<V, N, D>::room(s) + Scheme::room(s) + 4 * room_for<State>(s) + 3 * s.nq + s.nv;
   }
   Machine(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), newton(plan, arena), scheme(plan, arena), before(Velocities<V>::in(arena, plan)),
-        after(Velocities<V>::in(arena, plan)) {
-    q = arena.take(plan.nq), guess = arena.take(plan.nq), velocity = arena.take(plan.nv);
-    room_to_begin = arena.take(18 * plan.nodes);
+      : plan(scene), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
+    before = taken<State>(arena, plan), after = taken<State>(arena, plan);
+    origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
+    guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
   }
 
-  // The steps of worlds first … last − 1 that they have not made yet. A world whose step is not solved, or is refused, stops there.
-  void run(const Journey<T>& to, int first, int last, T dt, T tolerance, int most) {
-    journey = &to, next = first, end = last;
+  // All steps of worlds first … last − 1. Those that remain unsolved go on from the best that was found.
+  void run(const Journey<T>& to, const Rules& asked, int first, int last) {
+    journey = &to, rules = asked, next = first, end = last;
+    scheme.ask(rules);
     newton.running = M(false);
-    newton.tolerance = V(tolerance), newton.most = V(T(most)), newton.balance.dt = V(dt);
-    M fresh = able = M(false);
-    for (int i = 0; i < W; i++) put(fresh, i, board(i));
+    M fresh(false);
+    for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     while (any_aboard()) {
       set_out(fresh);
       do newton.pass();
@@ -58,26 +62,56 @@ template <class V, class N, int D = 3> struct Machine {
 
  private:
   const Journey<T>* journey;
+  Rules rules;
   int next, end;  // worlds that no lane has taken yet
-  int world[W];   // of each lane; −1: none
-  int step[W];    // of that world
-  M able;         // who could set out
+  // of each lane
+  int world[W];  // −1: none
+  int step[W];   // of that world
+  Itinerary<T, Scheme::easier> trips[W];
+  Fallbacks<T> ways[W];
+  bool plainly[W];  // it is posed the step itself
+  M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
     for (int i = 0; i < W; i++)
       if (world[i] >= 0) return true;
     return false;
   }
+  M aboard() const {
+    M there(false);
+    for (int i = 0; i < W; i++) put(there, i, world[i] >= 0);
+    return there;
+  }
 
-  // A lane takes the next world that has steps to make; whether there is one.
+  // A lane takes the next world; whether there is one. Idle lanes compute too, with the numbers of some world.
   bool board(int i) {
-    while (next < end && journey->made[next] >= journey->steps) next++;
-    // a lane without a world has the start of some world: idle lanes compute too
-    const bool found = next < end;
-    const int from = found ? next++ : end - 1;
-    world[i] = found ? from : -1, step[i] = journey->made[from];
-    load(i, from), steer(i, from);
-    return found;
+    const bool more = next < end;
+    const int from = more ? next++ : end - 1;
+    world[i] = more ? from : -1, step[i] = 0;
+    load(i, from);
+    depart(i);
+    return more;
+  }
+  void depart(int i) { steer(i), trips[i].begin(rules), attempt(i); }
+  void attempt(int i) { ways[i].begin(), pose(i); }
+
+  // What a lane is to solve next. Most have just made a step, and are to make one.
+  void pose(int i) {
+    const bool plain = trips[i].first() && ways[i].way == DIRECTLY;
+    if (plain && plainly[i]) return;
+    plainly[i] = plain;
+    Balance<V, N, D>& b = newton.balance;
+    const int halvings = trips[i].halvings;
+    const Stage problem = ways[i].problem();
+    const Start start = ways[i].start();
+    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(trips[i].eased ? 1.0 : Scheme::SHARE));
+    for (int j = 0; j < plan.nv; j++) put(b.fitted[j], i, lane(plan.share[halvings * plan.nv + j], i));
+    put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
+    put(b.relaxed.length, i, T(problem.length)), put(b.relaxed.lagged, i, problem.lagged);
+    put(newton.tolerance, i, T(ways[i].tolerance(rules.tolerance)));
+    put(newton.most, i, T(ways[i].most(trips[i].led() ? DIRECT : SOON)));
+    put(safe, i, start == GUESS_OR_RETREAT), put(from_guess, i, start == GUESS_OR_RETREAT || start == GUESS);
+    put(from_start, i, start == BEGINNING);
   }
 
   // Lanes are served together: what it costs to end a step is the same for one lane and for all.
@@ -87,82 +121,154 @@ template <class V, class N, int D = 3> struct Machine {
     for (int i = 0; i < W; i++) {
       if (world[i] < 0) continue;
       const bool runs = lane(newton.running, i);
-      busy += runs, ended += !runs, more = more || (!runs && step[i] + 1 < journey->steps);
+      busy += runs, ended += !runs, more = more || (!runs && goes_on(i));
     }
-    return busy == 0 || (more && 2 * ended >= W);
+    return busy == 0 || (more && ended >= busy);
+  }
+  bool goes_on(int i) const {
+    const bool led_on = !trips[i].first() || ways[i].way != DIRECTLY || lane(newton.status, i) > T(SOLVED);
+    return led_on || step[i] + 1 < journey->steps;
   }
 
-  // Lanes set out on their step: those on their way find the same again.
+  // Lanes set out on what they are to solve: those on their way find the same again.
   void set_out(M fresh) {
     if (!any(fresh)) return;
     Balance<V, N, D>& b = newton.balance;
-    for (int i = 0; i < plan.nv; i++) velocity[i] = scheme.velocity(before, i);
-    const M fits = near(q, plan.nq) & slow(plan, velocity, b.dt) & finite(b.control, plan.nu);
-    able = (able & !fresh) | (fits & fresh);
-    begin_energy_momentum(b, q, before.v, room_to_begin);
-    retract(plan, q, before.average, b.dt, guess);
-    // from NaN nothing is near, and the search ends at its start
-    for (int i = 0; i < plan.nq; i++) guess[i] = select(fits, guess[i], infinite<V>() - infinite<V>());
-    newton.begin(fresh, guess);
-    for (int i = 0; i < plan.nq; i++) newton.retreat[i] = select(fits | !fresh, newton.retreat[i], guess[i]);
+    scheme.velocity(before, b.dt, velocity);
+    const M fits = near(before.q, plan.nq) & slow(plan, velocity, b.dt) & finite(b.control, plan.nu);
+    scheme.begin(b, before, guess);
+    if (any(b.relaxed.length < V(1))) shorten();
+    b.begin();
+    for (int i = 0; i < plan.nq; i++) {
+      const V start = select(from_guess, guess[i], select(from_start, before.q[i], newton.q[i]));
+      from[i] = select(fits, start, infinite<V>() - infinite<V>());  // from NaN nothing is near, and the search ends at its start
+    }
+    b.relaxed.lagging = any(b.relaxed.lagged);
+    if (b.relaxed.lagging) hold(fresh & b.relaxed.lagged);
+    newton.begin(fresh, from, safe & fits);
   }
 
-  // Lanes whose step has ended go on with the next one, or with another world; who sets out now.
+  // Inertia as in a step that has gone on for a share of its time only.
+  void shorten() {
+    Balance<V, N, D>& b = newton.balance;
+    const V part = b.relaxed.length;
+    const M shorter = part < V(1);
+    auto nearer = [&](V start, V target) { return select(shorter, fma(part, target - start, start), target); };
+    for (int i = 0; i < D * D * plan.nodes; i++) b.target.rotation[i] = nearer(b.start.rotation[i], b.target.rotation[i]);
+    for (int i = 0; i < D * plan.nodes; i++) b.target.position[i] = nearer(b.start.position[i], b.target.position[i]);
+    difference(plan, b.q_start, b.q_target, velocity);
+    retract(plan, b.q_start, velocity, part, from);
+    for (int i = 0; i < plan.nq; i++) b.q_target[i] = select(shorter, from[i], b.q_target[i]);
+  }
+
+  // Friction is to feel the normal forces where lanes set out from.
+  void hold(M which) {
+    Balance<V, N, D>& b = newton.balance;
+    sight.look(from);
+    b.contacts.each_normal_force(sight.there, [&](int i, V force) { b.relaxed.held[i] = select(which, force, b.relaxed.held[i]); });
+  }
+
+  // Lanes whose solve has ended take the next detour, or their attempt has ended; who sets out now.
   M arrive() {
-    if (!newton.settled) newton.balance.evaluate(newton.trial);
-    const M refused = scheme.advance(newton.balance, newton.q, before, after);
-    M deep, far;
-    look_for_hazards(deep, far);
-    for (int i = 0; i < plan.nv; i++) velocity[i] = scheme.velocity(after, i);
-    const M lost = !(able & near(newton.q, plan.nq) & finite(velocity, plan.nv) & (newton.status < V(NON_FINITE)));
-    const M solved = newton.status <= V(SOLVED);
-    const M ended = aboard() & !newton.running, gone = ended & lost;
-    if (any(gone)) still(gone);
-    M fresh(false), goes_on(false);
+    const M ended = aboard() & !newton.running;
+    M doubted(false), strayed(false), better(false), led(false), over(false), fresh(false);
+    for (int i = 0; i < W; i++)
+      put(doubted, i, lane(ended, i) && trips[i].led() && ways[i].doubts(status(i), int(lane(newton.evaluations, i))));
+    if (any(doubted)) strayed = sight.strayed(newton.balance, newton.q, guess);
     for (int i = 0; i < W; i++) {
       if (!lane(ended, i)) continue;
-      const bool stays = lane(gone, i), stops = !stays && (lane(refused, i) || !lane(solved, i));
-      store(i);
-      report(i, stays ? NON_FINITE : int(lane(newton.status, i)), !stays && lane(refused, i),
-             stays ? 0 : TOO_DEEP * lane(deep, i) + TURNED_FAR * lane(far, i));
-      const bool last = step[i] + 1 == journey->steps;
-      if (!stops) step[i]++;
-      journey->made[world[i]] = step[i];
-      if (stops || last)
+      bool kept = false;
+      const bool more = led_on(i, lane(doubted, i) && lane(strayed, i), kept);
+      put(better, i, kept), put(fresh, i, more), put(over, i, !more), put(led, i, !more && trips[i].led());
+    }
+    if (any(better))
+      for (int i = 0; i < plan.nq; i++) found[i] = select(better, newton.q[i], found[i]);
+    if (any(led))
+      for (int i = 0; i < plan.nq; i++)
+        newton.q[i] = select(led, found[i], newton.q[i]), newton.trial[i] = select(led, found[i], newton.trial[i]);
+    if (any(led & !better)) newton.settled = false;
+    return any(over) ? fresh | conclude(over) : fresh;
+  }
+  int status(int i) const { return int(lane(newton.status, i)); }
+
+  // Whether a solve that has ended is followed by another one of the same attempt; whether it is the best so far.
+  bool led_on(int i, bool strayed, bool& better) {
+    auto& trip = trips[i];
+    auto& way = ways[i];
+    trip.evaluations += int(lane(newton.evaluations, i)), trip.iterations += int(lane(newton.iterations, i));
+    if (!trip.led()) return way.status = status(i), way.error = lane(newton.error, i), false;
+    const bool more = way.go_on(
+        status(i), lane(newton.error, i), strayed, rules.tolerance, better, [&](int cost) { return trip.affords(cost); },
+        [&](int kind) { trip.counts[kind] += trip.own(); });
+    if (more) pose(i);
+    if (!more && !trip.own() && way.error <= T(rules.tolerance)) way.status = SOLVED;
+    return more;
+  }
+
+  // Lanes whose attempt has ended try something else, or go on with the next step, or with another world; who sets out now.
+  M conclude(M over) {
+    Balance<V, N, D>& b = newton.balance;
+    if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
+    const M refused = scheme.advance(b, newton.q, before, after);
+    for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
+    M deep, far, kept(false), solved(false), failed(false), part(false), lost(false);
+    look_for_hazards(deep, far);
+    for (int i = 0; i < W; i++) {
+      if (!lane(over, i)) continue;
+      const bool good = ways[i].status <= HALVED && !lane(refused, i);
+      put(solved, i, ways[i].status <= HALVED), put(part, i, !trips[i].whole());
+      put(failed, i, !good && ways[i].status != NON_FINITE && trips[i].first());
+    }
+    V wanted(0);
+    if (any(failed)) copy(plan, failed, before, origin), wanted = scheme.halves(b, sight, after, solved);
+    if (any(part)) lost = part & got_lost(b.dt);
+
+    M ends(false), from_best(false), from_parts(false), back(false), shorter(false), further(false), fresh(false);
+    for (int i = 0; i < W; i++) {
+      if (!lane(over, i)) continue;
+      auto& trip = trips[i];
+      if (lane(failed, i)) trip.wanted = int(lane(wanted, i));
+      const bool worth = trip.whole() && (trip.first() || ways[i].error < infinite<T>());
+      int how = lane(lost, i) ? int(NON_FINITE) : ways[i].status;
+      if (how <= HALVED && lane(refused, i)) how = STALLED;
+      const Then then = trip.after(rules, how, ways[i].error, TOO_DEEP * lane(deep, i) + TURNED_FAR * lane(far, i));
+      const bool end = then <= END_OF_PARTS;
+      put(ends, i, end), put(fresh, i, !end), put(kept, i, worth && then != END);
+      put(from_best, i, then == END_AT_BEST), put(from_parts, i, then == END_OF_PARTS);
+      put(back, i, end ? !trip.first() : then == EASE || then == HALVE);
+      put(shorter, i, then == HALVE), put(further, i, then == NEXT_PART);
+    }
+    copy(plan, kept, after, best), copy(plan, from_best, best, after);
+    if (any(from_parts)) scheme.resize(from_parts, b.dt, V(T(rules.dt)), after);
+    copy(plan, back, origin, before), copy(plan, further, after, before);
+    for (int i = 0; i < W; i++)
+      if (lane(fresh, i)) attempt(i);
+    if (any(shorter)) scheme.resize(shorter, V(T(rules.dt)), b.dt, before);
+    return any(ends) ? fresh | deliver(ends) : fresh;
+  }
+
+  // Lanes whose step has ended hand it over and go on; who sets out now. Worlds that got lost are where they were.
+  M deliver(M ends) {
+    M gone = ends & got_lost(V(T(rules.dt))), fresh(false), same(false);
+    for (int i = 0; i < W; i++) put(gone, i, lane(gone, i) || (lane(ends, i) && trips[i].status == NON_FINITE));
+    copy(plan, gone, before, after);
+    for (int i = 0; i < W; i++) {
+      if (!lane(ends, i)) continue;
+      if (lane(gone, i)) trips[i].status = NON_FINITE, trips[i].hazards = 0;
+      store(i), report(i);
+      if (++step[i] == journey->steps)
         put(fresh, i, board(i));
       else
-        put(fresh, i, true), put(goes_on, i, true), steer(i, world[i]);
+        put(fresh, i, true), put(same, i, true), depart(i);
     }
-    if (any(goes_on)) go_on(goes_on);
+    copy(plan, same, after, before);
     return fresh;
   }
 
-  M aboard() const {
-    M there(false);
-    for (int i = 0; i < W; i++) put(there, i, world[i] >= 0);
-    return there;
-  }
-
-  // Worlds that got lost are where they were.
-  void still(M gone) {
-    for (int i = 0; i < plan.nq; i++) newton.q[i] = select(gone, q[i], newton.q[i]);
-    each([&](V* from, V* to) {
-      for (int i = 0; i < plan.nv; i++) to[i] = select(gone, from[i], to[i]);
-    });
-    after.gained = select(gone, before.gained, after.gained), after.surplus = select(gone, before.surplus, after.surplus);
-    after.peak = select(gone, before.peak, after.peak);
-  }
-  void go_on(M which) {
-    for (int i = 0; i < plan.nq; i++) q[i] = select(which, newton.q[i], q[i]);
-    each([&](V* to, V* from) {
-      for (int i = 0; i < plan.nv; i++) to[i] = select(which, from[i], to[i]);
-    });
-    before.gained = select(which, after.gained, before.gained), before.surplus = select(which, after.surplus, before.surplus);
-    before.peak = select(which, after.peak, before.peak);
-  }
-  template <class F> void each(F&& visit) {
-    visit(before.v, after.v), visit(before.push, after.push), visit(before.steady, after.steady);
-    visit(before.lag, after.lag), visit(before.average, after.average);
+  // Whose state after a step Δt is none that a step may start from.
+  M got_lost(V dt) {
+    scheme.velocity(after, dt, velocity);
+    return !(near(after.q, plan.nq) & finite(velocity, plan.nv));
   }
 
   // Of contacts and limits (contact/hazards.py).
@@ -178,38 +284,34 @@ template <class V, class N, int D = 3> struct Machine {
   }
 
   // Between a lane and the arrays.
-  void steer(int i, int from) {
-    const int last = journey->steps - 1, now = step[i] < last ? step[i] : last;
-    const long row = (journey->held ? 0 : long(now) * journey->worlds) + from;
+  void steer(int i) {
+    const int from = world[i] < 0 ? end - 1 : world[i];
+    const long row = (journey->held ? 0 : long(step[i]) * journey->worlds) + from;
     for (int j = 0; j < plan.nu; j++) put(newton.balance.control[j], i, journey->control[row * plan.nu + j]);
   }
   void load(int i, int from) {
     newton.balance.contacts.load(i, from);
-    const Journey<T>& a = *journey;
-    auto read = [&](const T* array, V* to, int count) {
-      for (int j = 0; j < count; j++) put(to[j], i, array[long(from) * count + j]);
-    };
-    read(a.q, q, plan.nq), read(a.v, before.v, plan.nv), read(a.push, before.push, plan.nv);
-    read(a.steady, before.steady, plan.nv), read(a.lag, before.lag, plan.nv), read(a.average, before.average, plan.nv);
-    read(a.gained, &before.gained, 1), read(a.surplus, &before.surplus, 1), read(a.peak, &before.peak, 1);
+    int k = 0;
+    State::each(plan, [&](auto member, int width) {
+      const T* array = static_cast<const T*>(journey->given[k++]) + long(from) * width;
+      for (int j = 0; j < width; j++) put((before.*member)[j], i, array[j]);
+    });
   }
   void store(int i) const {
-    const Journey<T>& a = *journey;
-    const Velocities<V>& x = after;
-    const long to = long(step[i]) * a.worlds + world[i];
-    auto write = [&](const V* values, T* array, int count) {
-      for (int j = 0; j < count; j++) array[to * count + j] = lane(values[j], i);
-    };
-    write(newton.q, a.q_out, plan.nq), write(x.v, a.v_out, plan.nv), write(x.push, a.push_out, plan.nv);
-    write(x.steady, a.steady_out, plan.nv), write(x.lag, a.lag_out, plan.nv), write(x.average, a.average_out, plan.nv);
-    write(&x.gained, a.gained_out, 1), write(&x.surplus, a.surplus_out, 1), write(&x.peak, a.peak_out, 1);
+    const long to = long(step[i]) * journey->worlds + world[i];
+    int k = 0;
+    State::each(plan, [&](auto member, int width) {
+      T* array = static_cast<T*>(journey->found[k++]) + to * width;
+      for (int j = 0; j < width; j++) array[j] = lane((after.*member)[j], i);
+    });
   }
-  void report(int i, int status, bool refused, int hazards) const {
+  void report(int i) const {
     const Journey<T>& a = *journey;
+    const auto& trip = trips[i];
     const long at = long(step[i]) * a.worlds + world[i];
-    a.residual_norm[at] = lane(newton.error, i), a.status[at] = status;
-    a.evaluations[at] = int(lane(newton.evaluations, i)), a.iterations[at] = int(lane(newton.iterations, i));
-    a.refused[at] = refused, a.hazards[at] = hazards;
+    a.residual_norm[at] = trip.error, a.status[at] = trip.status, a.hazards[at] = trip.hazards;
+    a.evaluations[at] = trip.evaluations, a.iterations[at] = trip.iterations;
+    for (int j = 0; j < FALLBACKS; j++) a.fallbacks[at * FALLBACKS + j] = trip.counts[j];
   }
 };
 

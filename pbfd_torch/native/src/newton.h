@@ -11,8 +11,10 @@ constexpr double NEGLIGIBLE = 0.1;     // of the scale, at most, may be left to 
 constexpr double RETREAT_ABOVE = 2.0;  // ‖r/scale‖ at the guess
 constexpr double OVERSHOOT = 0.5;      // of the work at the start
 constexpr double MAX_TURN = 1.0;       // [rad] of a joint in one step of Newton's
+constexpr double ABSURD = 1e6;         // what drives the bodies may move them by so many times their extent in a step, or [rad]
 
-enum Status { SOLVED = 0, STALLED = 5, ITERATION_LIMIT = 6, NON_FINITE = 7 };  // as solvers/objective.py
+// As solvers/objective.py: up to HALVED the step is solved.
+enum Status { SOLVED, WARM_STARTED, CONTINUED, EASED, HALVED, STALLED, ITERATION_LIMIT, NON_FINITE };
 
 template <class V, class N, int D = 3> struct Newton {
   using T = typename Kind<V>::Scalar;
@@ -43,8 +45,8 @@ template <class V, class N, int D = 3> struct Newton {
     running = at_guess = at_retreat = searching = M(false);
   }
 
-  // Lanes set out from a guess; θ_n is their retreat. Their balance has been begun.
-  void begin(M which, const V* guess) {
+  // Lanes set out from a guess; θ_n is the retreat of those that have one. Their balance has been begun.
+  void begin(M which, const V* guess, M safe) {
     for (int i = 0; i < plan.nq; i++) {
       q[i] = select(which, guess[i], q[i]), trial[i] = select(which, guess[i], trial[i]);
       retreat[i] = select(which, balance.q_start[i], retreat[i]);
@@ -55,8 +57,8 @@ template <class V, class N, int D = 3> struct Newton {
     const V per = V(8 * EPSILON) * balance.weight / tolerance;
     for (int i = 0; i < plan.nv; i++)
       allowed[i] = V(1) / fma(per, fma(far, V(plan.heft[i]), V(plan.armature[i])), V(plan.scale[i]));
-    running = running | which, at_guess = at_guess | which;
-    searching = searching & !which, at_retreat = at_retreat & !which;
+    running = running | which, searching = searching & !which;
+    at_guess = (at_guess & !which) | (which & safe), at_retreat = (at_retreat & !which) | (which & !safe);
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
     error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status), high = select(which, infinite<V>(), high);
   }
@@ -67,9 +69,11 @@ template <class V, class N, int D = 3> struct Newton {
     balance.evaluate(trial);
     bool assembled = false;
     const V reached = judged(assembled);
-    M finite = reached < infinite<V>();
+    const M finite = reached < infinite<V>();
     const M retreating = running & at_guess & !(finite & (reached <= V(RETREAT_ABOVE)));
-    const M lost = running & at_retreat & !finite, usable = running & finite & !retreating;
+    M hopeless = !finite;
+    if (any(running & at_retreat)) hopeless = hopeless | absurd();
+    const M lost = running & at_retreat & hopeless, usable = running & finite & !retreating & !lost;
     const M arrived = usable & (reached <= tolerance);
     evaluations += select(running, V(1), V(0));
     iterations += select(arrived & searching, V(1), V(0));
@@ -122,6 +126,17 @@ template <class V, class N, int D = 3> struct Newton {
       lenient = fma(a, a, lenient);
     }
     return select(near, max(sqrt(lenient), least), first);
+  }
+
+  // Where the forces are not to be balanced (`BalanceObjective.absurd`): what drives the bodies would move them beyond all reason.
+  M absurd() {
+    V *driven = column, *slopes = step;  // these are not asked for
+    for (int i = 0; i < plan.nv; i++) driven[i] = slopes[i] = V(0);
+    joint_loads<SMOOTH | DRY>(plan, balance.steps(), trial, driven, slopes);
+    M found(false);
+    for (int i = 0; i < plan.nv; i++)
+      found = found | (abs(driven[i]) > V(ABSURD) * balance.weight * fma(far, V(plan.heft[i]), V(plan.armature[i])));
+    return found;
   }
   V extent(int j) const { return select(V(plan.turns[j]) > V(0), V(1), far); }
 

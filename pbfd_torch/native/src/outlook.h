@@ -7,7 +7,7 @@ namespace pbfd {
 
 // A contact that may touch along the direction.
 template <class V> struct Coming {
-  V depth, start, steepness, sinks, faster, stiffness, mu, per_range, per_width, size, along, square, cube, fourth;
+  V depth, start, steepness, sinks, faster, stiffness, mu, holding, per_range, per_width, size, along, square, cube, fourth;
 };
 
 // A limit that may be reached.
@@ -23,6 +23,7 @@ template <class V, class N, int D = 3> struct Outlook {
   int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
   V per_limit_range;
+  const Relaxed<V>* relaxed;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -38,7 +39,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     count = limits = 0, base = slope = zero;
-    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt);
+    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt), relaxed = &b.relaxed;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, d);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
@@ -53,7 +54,7 @@ template <class V, class N, int D = 3> struct Outlook {
         const V past = sign * (q[c] - bound), speed = sign * d[i];
         if (!any(((past > zero) | (past + speed > zero)) & where)) continue;
         Stop<V>& out = stops[limits++];
-        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), b.limits[i]};
+        out = {past, speed, max(sign * (b.q_start[c] - bound), zero), relaxed->firmness * b.limits[i]};
       }
     }
     V known;
@@ -100,15 +101,16 @@ template <class V, class N, int D = 3> struct Outlook {
       times<D>(at.bend, v, tilt);
       deepens -= dot<D>(tilt, v);
     }
+    at.holding = relaxed->holding(i);
     const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
-    if (!any((at.depth + grows > zero) & where)) return;
+    if (!any(((at.depth + grows > zero) | (at.holding > zero)) & where)) return;
     if constexpr (simple) {
       contacts.touch(pair, i, at);
       if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
     }
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
-    out.stiffness = at.firmness, out.mu = at.grip, out.per_range = at.per_range, out.per_width = at.per_width;
+    out.stiffness = at.firmness, out.mu = at.grip, out.holding = at.holding, out.per_range = at.per_range, out.per_width = at.per_width;
     V u[D];
     at.template travel<Support>(u);
     slide(out, u, n, v, a, faster);
@@ -159,9 +161,11 @@ template <class V, class N, int D = 3> struct Outlook {
     slip_law(sqrt(max(square, V(0))), c.per_width, factor, falls);
     const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
     const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth);
-    const V grows = rises * c.steepness * speed, drags = (grows * factor + push * falls * on) * on + push * factor * further;
-    df = grows * speed + push * c.faster + c.mu * drags;
-    return push * speed + c.mu * push * factor * on;
+    V pressed = push, firmer = rises;
+    relaxed->felt(c.holding, pressed, firmer);
+    const V grows = c.steepness * speed, drags = (firmer * grows * factor + pressed * falls * on) * on + pressed * factor * further;
+    df = rises * grows * speed + push * c.faster + c.mu * drags;
+    return push * speed + c.mu * pressed * factor * on;
   }
 
   V of_limit(const Stop<V>& s, V a, V& df) const {

@@ -14,7 +14,7 @@ inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; 
 inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0; }  // of these, the first
 
 struct Sizes : CandidateSizes {
-  int nodes, nq, nv, nu, pushes;
+  int nodes, nq, nv, nu, halvings, pushes;
 };
 
 template <class N, int D = 3> struct Plan : Sizes {
@@ -30,7 +30,7 @@ template <class N, int D = 3> struct Plan : Sizes {
   const N *scale;  // what counts as a force of one
   const N *heft;   // [kg, kg m] what rounded positions weigh
   const N *turns;  // 1 where it rotates, else 0
-  const N *share;  // θ of springs, damping and actuators (`Fitted`), 1 where all is implicit
+  const N *share;  // θ of springs, damping and actuators (`Fitted`), 1 where all is implicit: [nv] of steps Δt, Δt/2, Δt/4 …
   const N *spring, *damping, *armature, *dry, *lower, *upper, *limit;
   const N *rest;  // [nq] of the springs
   // actuators
@@ -54,7 +54,7 @@ template <class N, int D = 3> struct Plan : Sizes {
     actuated_q = whole(nu), actuated_v = whole(nu);
     frame = real(D * D * nodes), origin = real(D * nodes), reference = real(nodes), sense = real(nodes);
     mass = real(nodes), center = real(D * nodes), second = real(D * D * nodes), carried = real(nodes);
-    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv);
+    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv * (1 + halvings));
     spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
@@ -66,7 +66,8 @@ template <class N, int D = 3> struct Plan : Sizes {
 
   static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.pushes + Candidates<N, D>::whole_numbers(s); }
   static int real_numbers(Sizes s) {
-    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes + Candidates<N, D>::real_numbers(s);
+    return (2 * D * (D + 1) + 4) * s.nodes + (11 + s.halvings) * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes +
+           Candidates<N, D>::real_numbers(s);
   }
 };
 

@@ -6,6 +6,7 @@
 #pragma once
 #include "friction.h"
 #include "loads.h"
+#include "relaxed.h"
 #include "release.h"
 #include "supports.h"
 #include "surfaces.h"
@@ -19,6 +20,8 @@ template <class V, int D> struct Touching {
   Arm<V, D> arm;
   V depth, start;          // at the end of the step and at its beginning
   V firmness, grip, per_range, per_width;  // C⊥, μ; 1 / (release speed and slip speed × Δt)
+  V holding;                               // the normal force that friction feels, where it is lagged
+  const Relaxed<V>* relaxed;
   const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
 
   // m
@@ -39,7 +42,9 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
   V push, rises, factor, falls;
   release_law(t.firmness, t.depth, t.start, t.per_range, push, rises);
   slip_law(sqrt(dot<D>(u, u)), t.per_width, factor, falls);
-  const V drag = t.grip * push * factor, by_depth = t.grip * rises * factor, by_size = t.grip * push * falls;
+  V pressed = push, firmer = rises;
+  t.relaxed->felt(t.holding, pressed, firmer);
+  const V drag = t.grip * pressed * factor, by_depth = t.grip * firmer * factor, by_size = t.grip * pressed * falls;
   for (int j = 0; j < D; j++) f[j] = fma(push, n[j], -(drag * u[j]));
 
   // answers: −δf of a motion that makes the slip grow by `slips` and the depth fall by `sinks`, but for what the normal's turn does

@@ -1,0 +1,32 @@
+// What is asked of an integrator's steps, and what it keeps from one to the next: a state is a struct of pointers to arrays, with
+// `each(sizes, visit)`, which visits (member, width) in the order of the interface; the first one is q.
+#pragma once
+#include "plan.h"
+
+namespace pbfd {
+
+struct Rules {
+  double dt, tolerance, surplus;  // [s], of ‖r/scale‖, see `EnergyMomentum`
+  int halvings, evaluations;      // how often a step may be halved; at most, with all that is tried
+};
+
+template <class State> inline int room_for(Sizes s) {
+  int count = 0;
+  State::each(s, [&](auto, int width) { count += width; });
+  return count;
+}
+
+template <class State, class V> inline State taken(Arena<V>& arena, Sizes s) {
+  State x;
+  State::each(s, [&](auto member, int width) { x.*member = arena.take(width); });
+  return x;
+}
+
+template <class State, class M> inline void copy(Sizes s, M which, const State& from, State& to) {
+  if (!any(which)) return;
+  State::each(s, [&](auto member, int width) {
+    for (int i = 0; i < width; i++) (to.*member)[i] = select(which, (from.*member)[i], (to.*member)[i]);
+  });
+}
+
+}  // namespace pbfd
