@@ -25,7 +25,8 @@ template <class V, class N, int D> inline V height(const Plan<N, D>& plan, int i
 template <class V, class N, int D>
 inline void contacts(const Plan<N, D>& plan, const ContactStep<V>& step, Poses<V> now, Push<V, D>* pushes, V* rolls, bool* turned) {
   constexpr int T = turns(D), S = T + D;
-  const V zero(0), per_dt = V(1) / step.dt, per_range = per_dt * V(N(1) / plan.release[0]), per_width = per_dt * V(N(1) / plan.slip_speed[0]);
+  const V zero(0), per_dt = V(1) / step.dt;
+  const V per_range = per_dt * V(N(1) / plan.release[0]), per_width = per_dt * V(N(1) / plan.slip_speed[0]);
   for (int k = 0; k < plan.nodes; k++) turned[k] = false;
   for (int i = 0; i < plan.candidates; i++) {
     V c[D], before[D], n[D];
