@@ -1,0 +1,151 @@
+// Every kind of contact: J is the derivative of r, what a direction promises sets out along r·d and dᵀJd, and a world gets the same
+// numbers in a register of worlds and by itself.
+#include "outlook.h"
+
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "check.h"
+
+using namespace pbfd;
+
+namespace {
+
+constexpr double DT = 0.01, MASS = 1.0, SECOND = 0.01, INF = std::numeric_limits<double>::infinity();
+constexpr int NQ = 7, NV = 6, WORLDS = 11, KINDS = Candidates<double, 3>::KINDS, CELLS = 9;
+
+// A free body at z = 1.2 or so that touches a solid whose top is at z = 1, by a candidate of one kind.
+struct Scene {
+  std::vector<int> whole;
+  std::vector<double> real;
+  Sizes sizes;
+
+  explicit Scene(int kind) {
+    const bool plane = kind < 3, rim = kind == 2 || kind >= 9;
+    const int solid = plane ? -1 : (kind - 3) % 6, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
+    whole = {-1, FREE, 0, 0, 1, 0, 1, 2, 3, 4, 5};  // how many dofs each dof rides on, and which
+    for (int i = 0; i < NV; i++)
+      for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);
+    for (int k = 0; k < KINDS; k++) whole.push_back(k == kind);
+    whole.insert(whole.end(), {0, 0, 0});  // carrier, solid, form
+    if (!plane) whole.insert(whole.end(), {0, CELLS, CELLS, solid == 5 ? CELLS : 1});
+    real = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, MASS, 0.01, 0, 0.02, SECOND, 0, 0, 0, SECOND, 0, 0, 0, 2 * SECOND, MASS};
+    auto each = [&](double straight, double turning) {
+      for (int i = 0; i < NV; i++) real.push_back(i < 3 ? straight : turning);
+    };
+    each(10, 1), each(MASS, 0.1), each(0, 1), each(0.5, 0.5);
+    for (int what = 0; what < 4; what++) each(0, 0);
+    each(-INF, -INF), each(INF, INF), each(0, 0);
+    real.insert(real.end(), {0, 0, 0, 1, 0, 0, 0});
+    real.insert(real.end(), {0, 0, -9.81, 0.2, 1, 0, 1e-3});
+    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 0.3, 1e-2});
+    if (plane) real.insert(real.end(), {0, 0, 1, 1});
+    if (!plane) {
+      real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == 4 ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
+      const double sizes[6][6] = {{1}, {0.6, 0.4}, {0.5, 0.6, 1}, {0.7, 1}, {-0.4, -0.4, 0.1, 0.1}, {-0.4, -0.4, 0.6, 0.1}};
+      real.insert(real.end(), sizes[solid], sizes[solid] + 6);
+      real.push_back(solid < 4 ? 1 : INF);
+      for (int i = 0; i < samples; i++)  // hills, or heights above z = 1, with waves
+        real.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
+    }
+    if (rim) real.insert(real.end(), {0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.03, 0, 1, 0, 0});
+    sizes = {{1, plane, !plane, samples, rim}, 1, NQ, NV, 0, 0, 0};
+    CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));
+    CHECK(Plan<double>::real_numbers(sizes) == int(real.size()));
+  }
+};
+
+// Room for a balance and an outlook.
+template <class V> struct Room {
+  std::vector<V> memory;
+  explicit Room(Sizes s) : memory(Balance<V, double>::room(s) + Outlook<V, double>::room(s)) {}
+  Arena<V> arena() { return {memory.data()}; }
+};
+
+// The step of a world: it has begun a little beside q.
+template <class V> void begin(Balance<V, double>& b, const V* q, V* v, V* room) {
+  V before[NQ];
+  for (int i = 0; i < NV; i++) v[i] = V(0.2 * std::sin(3.0 * i + 1));
+  retract(b.plan, q, v, V(-DT), before);
+  b.dt = V(DT), b.share = V(0.5);
+  for (int i = 0; i < NV; i++) b.fitted[i] = V(0.5);
+  begin_energy_momentum(b, before, v, room);
+  b.begin();
+}
+
+void start(double* q, int world, double height) {
+  const double turn[3] = {0.2 * std::sin(1.0 * world), 0.15 * std::cos(2.0 * world), 0.1 * world};
+  q[0] = 0.03 * std::sin(4.0 * world), q[1] = 0.02 * std::cos(5.0 * world), q[2] = height;
+  quaternion_exp(turn, q + 3);
+}
+
+void of_kind(int kind) {
+  const Scene scene(kind);
+  const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data());
+  const double height = scene.sizes.forms ? 1.15 : 1.17;
+  using V = Lanes<double, 4>;
+  Room<double> alone(scene.sizes), beside(scene.sizes);
+  Room<V> together(scene.sizes);
+  Arena<double> arena = alone.arena(), second = beside.arena();
+  Arena<V> wide = together.arena();
+  Balance<double, double> b(plan, arena), moved(plan, second);
+  Outlook<double, double> outlook(plan, arena);
+  Balance<V, double> all(plan, wide);
+  double v[NV], room[18];
+  V q_all[NQ], v_all[NV], room_all[18];
+  int touched = 0;
+  for (int world = 0; world < WORLDS; world++) {
+    double q[NQ], d[NV], shifted[NQ];
+    start(q, world, height);
+    begin(b, q, v, room), begin(moved, q, v, room);
+    b.evaluate(q), b.assemble(q, true);
+    touched += b.pushes[0].any;
+    double largest = 1, work = 0, curve = 0, known;
+    for (int i = 0; i < NV * NV; i++) largest = std::fmax(largest, std::fabs(b.matrix[i]));
+    double off[NV][NV];  // differences of r less J
+    for (int j = 0; j < NV; j++) {
+      double column[2][NV];
+      for (int side = 0; side < 2; side++) {
+        for (int i = 0; i < NV; i++) d[i] = i == j ? (side ? 1e-6 : -1e-6) : 0;
+        retract(plan, q, d, 1.0, shifted);
+        moved.evaluate(shifted);
+        for (int i = 0; i < NV; i++) column[side][i] = moved.residual[i];
+      }
+      for (int i = 0; i < NV; i++) off[i][j] = (column[1][i] - column[0][i]) / 2e-6 - b.matrix[NV * i + j];
+    }
+    for (int i = 0; i < NV; i++)
+      for (int j = 0; j < NV; j++) {
+        const bool turns = i >= 3 && j >= 3;  // torques along axes that turn themselves: J is that of a chart which does not
+        CHECK(std::fabs(turns ? 0.5 * (off[i][j] + off[j][i]) : off[i][j]) < 1e-6 * largest);
+      }
+    for (int i = 0; i < NV; i++) d[i] = 0.01 * std::cos(2.0 * i + world), work += b.residual[i] * d[i];
+    for (int i = 0; i < NV; i++)
+      for (int j = 0; j < NV; j++) curve += d[i] * b.matrix[NV * i + j] * d[j];
+    outlook.look(b, q, d, work, curve, true);
+    CHECK(std::fabs(outlook.work(0, known) - work) <= 1e-12 * std::fabs(work));
+    CHECK(outlook.count == 1);
+
+    for (int i = 0; i < Kind<V>::lanes; i++) {
+      double other[NQ];
+      start(other, world + 3 * i, height);
+      for (int j = 0; j < NQ; j++) put(q_all[j], i, other[j]);
+    }
+    begin(all, q_all, v_all, room_all);
+    all.evaluate(q_all), all.assemble(q_all, true);
+    for (int i = 0; i < NV; i++) CHECK(lane(all.residual[i], 0) == b.residual[i]);
+    for (int i = 0; i < NV * NV; i++) CHECK(lane(all.matrix[i], 0) == b.matrix[i]);
+  }
+  CHECK(touched == WORLDS);
+}
+
+}  // namespace
+
+int main() {
+  for (int kind = 0; kind < KINDS; kind++) {
+    const int before = failures();
+    of_kind(kind);
+    if (failures() > before) std::fprintf(stderr, "kind %d\n", kind);
+  }
+  return failures();
+}
