@@ -37,9 +37,7 @@ class Scheme:
 
 
 SCHEMES: dict[type, Scheme] = {
-    EnergyMomentum: Scheme(
-        "pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")
-    ),
+    EnergyMomentum: Scheme("pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
     ImplicitEuler: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
 }
 
