@@ -1,4 +1,4 @@
-// A ball is dropped, in a register of worlds and in worlds by themselves: it comes to rest on the ground, and both agree to the bit.
+// A ball is dropped, in a register of worlds and in worlds by themselves: it comes to rest on the ground; both agree to the bit.
 #include "bodies.h"
 
 #include <cmath>

@@ -21,8 +21,9 @@ template <template <class, class> class Scheme, class V> void make(const pbfd_pl
   const Plan<T> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   Arena<V> arena{static_cast<V*>(room)};
   Machine<V, T, Scheme<V, T>> machine(plan, arena);
-  const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
-                           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
+  const Journey<T> journey{
+      s->worlds,  s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found, static_cast<T*>(s->residual_norm),
+      s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
   machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, p->halvings, s->evaluations}, s->first, s->last);
 }
 
