@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -49,6 +50,7 @@ class Course:
         worlds: batches.
         drive: random controls are the held one ± this.
         shipped: least steps of MuJoCo's Runge–Kutta 4 in a control step.
+        bound: error beyond which a motion of MuJoCo's is none of this scene [m].
     """
 
     case: Case
@@ -57,6 +59,7 @@ class Course:
     worlds: tuple[int, ...] = (1, 64, 1024)
     drive: float = 1.0
     shipped: int = 1
+    bound: float = math.inf
 
     @property
     def scene(self) -> str:
@@ -116,6 +119,6 @@ _COURSES = (
     _robot("walker", 6, 1.0),
     _robot("quadruped", 12, 0.3),
     Course(CASES["chain-ground"], 0.02, 100, (1, 64, 256, 1024)),
-    Course(CASES["chain-slope-drop"], 0.05, 100),
+    Course(CASES["chain-slope-drop"], 0.05, 100, bound=0.5),
 )
 COURSES: Mapping[str, Course] = {course.scene: course for course in _COURSES}

@@ -1,0 +1,226 @@
+"""Control steps a second of our engines and of MuJoCo, on the same scenes in one run, and the error beside them.
+
+Every contestant makes the same rollouts: `steps` control steps of many worlds, each from a start and under random controls of its
+own. The contestants of a batch take turns, and the shortest time of each counts: CPU time for one thread, wall time for several.
+Errors are those of `pbfd bench precision`: of one motion from the scene's own start.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from pbfd_torch.bench import mujoco_runs
+from pbfd_torch.bench.precision import OURS, OWN, PEER, Reference, peer_reference, reference_of
+from pbfd_torch.bench.precision_tracks import Track
+from pbfd_torch.bench.speed_mujoco import INTEGRATORS, Peer, fewest
+from pbfd_torch.bench.speed_ours import DTYPES, ENGINES, Call, Ours, Outcome, definition
+from pbfd_torch.bench.speed_scenes import COURSES, Course, Work, spread
+from pbfd_torch.bench.timing import Progress
+
+Contestant = Ours | Peer
+NOTES = (
+    "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
+    "thread, wall time for several; µs: of one world's control step",
+    "a rollout: every world from a start of its own near the scene's, under random controls of its own; robots 1 s, chain-ground "
+    "2 s, chain-slope-drop 5 s; one world: several such rollouts, one after another",
+    "torch: a few steps each from times spread evenly over those rollouts, which would take too long; its first step after such a "
+    "start does not count",
+    "MuJoCo: `mujoco.rollout`, all in C. It has no batch, so that more than 1024 steps of single worlds within a control step are "
+    "not timed: fewer worlds, 64 at least, stand for them. mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper "
+    "and walker. Contacts on the chains are as stiff as it takes them, those of robots as their files have them",
+    "steps: in a control step; where one of MuJoCo's does not do, the fewest with which nothing diverges",
+    "error: over one motion from the scene's own start, of each simulator against itself at a fine step (robots: the root until "
+    ".4 s under sines; chain-ground: centre of mass at .4 s, after the first impact; later the reference itself is not converged), "
+    "chain-slope-drop: against Coulomb's law after 5 s; ±: by how much the reference changed as its step was halved",
+    "warm-up: from nothing until the first step, and by how much the first run took longer than the best",
+)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured.
+
+    Attributes:
+        scenes: that are run where none are asked for.
+        worlds: batches beyond this are left out.
+        steps: control steps of a rollout, at most.
+        alone: rollouts of a single world, one after another.
+        rounds: at most.
+        enough_s: a contestant that has taken this long takes no further turn.
+        eager_steps: timed of torch, from each start.
+        own_step, own_peer_step: [s] of the motions that serve as references.
+    """
+
+    scenes: tuple[str, ...] = tuple(COURSES)
+    worlds: tuple[int, ...] = (1, 64, 256, 1024)
+    steps: int = 1000
+    alone: int = 8
+    rounds: int = 7
+    enough_s: float = 3.0
+    eager_steps: int = 3
+    own_step: float = 0.0005
+    own_peer_step: float = 0.0001
+
+    def worlds_of(self, course: Course) -> tuple[int, ...]:
+        """Batches of a scene."""
+        return tuple(worlds for worlds in course.worlds if worlds in self.worlds)
+
+    def units(self, course: Course, threads: Sequence[int], peers: bool) -> int:
+        """How often `measure_scene` tells its progress."""
+        contestants = len(ENGINES) * len(DTYPES) + len(INTEGRATORS) * peers
+        return contestants * (1 + len(threads) * len(self.worlds_of(course)))
+
+
+FULL = Effort()
+QUICK = Effort(("hopper", "chain-slope-drop"), (1, 1024), 50, 2, 2, 0.5, 1, 0.001, 0.0005)
+
+
+@dataclass
+class Turns:
+    """A contestant's runs of one batch."""
+
+    call: Call
+    world_steps: int
+    ready_s: float
+    outcome: Outcome = field(default_factory=Outcome)
+    times: list[float] = field(default_factory=list)
+
+    def take(self, clock: Callable[[], float]) -> None:
+        """One more."""
+        began = clock()
+        self.outcome = self.call()
+        self.times.append(clock() - began)
+
+    @property
+    def warmup_s(self) -> float:
+        return self.ready_s + self.times[0] - min(self.times)
+
+
+def all_threads() -> tuple[int, ...]:
+    """One, and as many as there are processors to use."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (1,) if usable == 1 else (1, usable)
+
+
+def measure_scene(course: Course, effort: Effort, threads: Sequence[int], peers: bool, progress: Progress) -> dict[str, Any]:
+    """All rows of one scene as plain data. peers: with MuJoCo."""
+    course = replace(course, steps=min(course.steps, effort.steps))
+    work = course.work(max(effort.worlds_of(course)))
+    with mujoco_runs.silent() if peers else nullcontext():
+        references = {OURS: _our_reference(course, effort.own_step)}
+        if peers:
+            references[PEER] = peer_reference(course.case, effort.own_peer_step)
+        contestants = _contestants(course, work, peers)
+        errors = {}
+        for one in contestants:
+            errors[one] = _error(one, references)
+            progress(1)
+        path = definition(course).path(work.of(0, 16))
+        rows: list[dict[str, Any]] = []
+        for count in threads:
+            torch.set_num_threads(count)
+            for worlds in effort.worlds_of(course):
+                turns = _measured(contestants, work, path, worlds, count, effort, progress)
+                for one, note in contestants.items():
+                    rows.append(_row(one, course, worlds, count, turns.get(one), errors[one], one.missing(count) or note))
+        torch.set_num_threads(1)
+    own = {name: {"source": found.source, "uncertainty_m": found.uncertainty} for name, found in references.items()}
+    about = {"dt_s": course.dt, "steps": course.steps, "error_of": course.case.title}
+    return {**about, "references": {} if course.case.exact else own, "rows": rows}
+
+
+def _our_reference(course: Course, dt: float) -> Reference:
+    return reference_of(course.case, OWN, dt, lambda step, until: definition(replace(course, dt=step)).motion(course.case, until))
+
+
+def _contestants(course: Course, work: Work, peers: bool) -> Mapping[Contestant, str]:
+    """All, and what there is to say about each."""
+    found: dict[Contestant, str] = {Ours(course, engine, dtype): "" for engine in ENGINES for dtype in DTYPES}
+    for engine in INTEGRATORS if peers else ():
+        peer, note = fewest(course, engine, work.of(0, 64))
+        found[peer] = note
+    return found
+
+
+def _error(one: Contestant, references: Mapping[str, Reference]) -> float:
+    """[m]; NaN where there is no such motion."""
+    case = one.course.case
+    if one.missing(1):
+        return math.nan
+    track: Track = one.motion(case, min(case.duration, case.observed_s))
+    return case.error(track, references[OURS if isinstance(one, Ours) else PEER].value)
+
+
+def _works(one: Contestant, work: Work, path: Track, worlds: int, effort: Effort) -> Sequence[Work]:
+    """What a contestant does in one turn."""
+    if one.engine == "torch":
+        groups = effort.alone if worlds == 1 else 1
+        return spread(work, path, worlds, groups, effort.eager_steps)
+    if worlds == 1:
+        return [work.of(k, 1) for k in range(effort.alone)]
+    return [work.of(0, worlds if isinstance(one, Ours) else min(worlds, max(64, 1024 // one.substeps)))]
+
+
+def _measured(
+    contestants: Mapping[Contestant, str],
+    work: Work,
+    path: Track,
+    worlds: int,
+    threads: int,
+    effort: Effort,
+    progress: Progress,
+) -> Mapping[Contestant, Turns]:
+    """Those that can run, in turns."""
+    clock = time.process_time if threads == 1 else time.perf_counter
+    found: dict[Contestant, Turns] = {}
+    for one in contestants:
+        if one.missing(threads):
+            progress(1)
+            continue
+        works = _works(one, work, path, worlds, effort)
+        began = time.perf_counter()
+        call = one.ready(works, threads, under_way=one.engine == "torch")
+        found[one] = Turns(call, sum(x.world_steps for x in works), time.perf_counter() - began)
+    for k in range(effort.rounds):
+        for turns in found.values():
+            if k == 0 or sum(turns.times) < effort.enough_s:
+                turns.take(clock)
+            if k == 0:
+                progress(1)
+    return found
+
+
+def _row(
+    one: Contestant, course: Course, worlds: int, threads: int, turns: Turns | None, error: float, note: str
+) -> dict[str, Any]:
+    """One line; without numbers where there is nothing to measure."""
+    seconds = math.nan if turns is None else min(turns.times) / turns.world_steps
+    outcome = Outcome() if turns is None else turns.outcome
+    return {
+        "scene": course.scene,
+        "engine": one.engine,
+        "dtype": one.dtype,
+        "worlds": worlds,
+        "threads": threads,
+        "dt_s": course.dt,
+        "substeps": one.substeps,
+        "control_steps_per_s": 1 / seconds,
+        "physics_steps_per_s": one.substeps / seconds,
+        "us_per_step": 1e6 * seconds,
+        "ms_per_simulated_s": 1e3 * seconds / course.dt,
+        "evaluations_mean": outcome.evaluations,
+        "solved_share": outcome.solved,
+        "fallback_share": outcome.fallbacks,
+        "error_m": error,
+        "warmup_s": math.nan if turns is None else turns.warmup_s,
+        "timed_world_steps": 0 if turns is None else turns.world_steps,
+        "note": note,
+    }
