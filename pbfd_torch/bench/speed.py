@@ -29,10 +29,10 @@ Contestant = Ours | Peer
 NOTES = (
     "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
     "thread, wall time for several; µs: of one world's control step",
-    "a rollout: every world from a start of its own near the scene's, under random controls of its own; robots 1 s, chain-ground "
-    "2 s, chain-slope-drop 5 s; one world: several such rollouts, one after another",
-    "torch: a few steps each from times spread evenly over those rollouts, which would take too long; its first step after such a "
-    "start does not count",
+    "a rollout: every world from a start of its own near the scene's, the first from the scene's own, robots under random controls; "
+    "one world: chains from the scene's own start, robots several rollouts, one after another",
+    "ours where whole rollouts would take too long, as torch's do: a few steps from times spread evenly over them; the first step "
+    "after such a start does not count",
     "MuJoCo: `mujoco.rollout`, all in C. It has no batch, so that more than 1024 steps of single worlds within a control step are "
     "not timed: fewer worlds, 64 at least, stand for them. mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper "
     "and walker. Contacts on the chains are as stiff as it takes them, those of robots as their files have them",
@@ -55,7 +55,8 @@ class Effort:
         alone: rollouts of a single world, one after another.
         rounds: at most.
         enough_s: a contestant that has taken this long takes no further turn.
-        eager_steps: timed of torch, from each start.
+        patience_s: ours whose rollouts would take longer makes a few steps instead.
+        few: how many.
         own_step, own_peer_step: [s] of the motions that serve as references.
     """
 
@@ -65,7 +66,8 @@ class Effort:
     alone: int = 8
     rounds: int = 7
     enough_s: float = 3.0
-    eager_steps: int = 3
+    patience_s: float = 6.0
+    few: int = 3
     own_step: float = 0.0005
     own_peer_step: float = 0.0001
 
@@ -80,7 +82,7 @@ class Effort:
 
 
 FULL = Effort()
-QUICK = Effort(("hopper", "chain-slope-drop"), (1, 1024), 50, 2, 2, 0.5, 1, 0.001, 0.0005)
+QUICK = Effort(("hopper", "chain-slope-drop"), (1, 1024), 50, 2, 2, 0.5, 0.5, 1, 0.001, 0.0005)
 
 
 @dataclass
@@ -159,14 +161,32 @@ def _error(one: Contestant, references: Mapping[str, Reference]) -> float:
     return case.error(track, references[OURS if isinstance(one, Ours) else PEER].value)
 
 
-def _works(one: Contestant, work: Work, path: Track, worlds: int, effort: Effort) -> Sequence[Work]:
+def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence[Work]:
     """What a contestant does in one turn."""
-    if one.engine == "torch":
-        groups = effort.alone if worlds == 1 else 1
-        return spread(work, path, worlds, groups, effort.eager_steps)
     if worlds == 1:
-        return [work.of(k, 1) for k in range(effort.alone)]
+        return [work.of(k, 1) for k in range(min(one.course.alone, effort.alone))]
     return [work.of(0, worlds if isinstance(one, Ours) else min(worlds, max(64, 1024 // one.substeps)))]
+
+
+def _entered(one: Contestant, works: Sequence[Work], few: Sequence[Work], threads: int, patience_s: float) -> Turns:
+    """A contestant of ours makes a few steps first, and no more if the whole works would take longer than `patience_s`."""
+    clock = _clock(threads)
+    began = time.perf_counter()
+    if isinstance(one, Ours):
+        turns = Turns(one.ready(few, threads), _world_steps(few), time.perf_counter() - began)
+        turns.take(clock)
+        if turns.times[0] * _world_steps(works) / turns.world_steps > patience_s:
+            return turns
+        began = time.perf_counter()
+    return Turns(one.ready(works, threads), _world_steps(works), time.perf_counter() - began)
+
+
+def _world_steps(works: Sequence[Work]) -> int:
+    return sum(x.world_steps for x in works)
+
+
+def _clock(threads: int) -> Callable[[], float]:
+    return time.process_time if threads == 1 else time.perf_counter
 
 
 def _measured(
@@ -179,22 +199,18 @@ def _measured(
     progress: Progress,
 ) -> Mapping[Contestant, Turns]:
     """Those that can run, in turns."""
-    clock = time.process_time if threads == 1 else time.perf_counter
+    clock = _clock(threads)
     found: dict[Contestant, Turns] = {}
     for one in contestants:
-        if one.missing(threads):
-            progress(1)
-            continue
-        works = _works(one, work, path, worlds, effort)
-        began = time.perf_counter()
-        call = one.ready(works, threads, under_way=one.engine == "torch")
-        found[one] = Turns(call, sum(x.world_steps for x in works), time.perf_counter() - began)
-    for k in range(effort.rounds):
+        if not one.missing(threads):
+            works = _works(one, work, worlds, effort)
+            few = spread(work, path, worlds, len(works) if worlds == 1 else 1, effort.few)
+            found[one] = _entered(one, works, few, threads, effort.patience_s)
+        progress(1)
+    for _ in range(effort.rounds):
         for turns in found.values():
-            if k == 0 or sum(turns.times) < effort.enough_s:
+            if sum(turns.times) < effort.enough_s:
                 turns.take(clock)
-            if k == 0:
-                progress(1)
     return found
 
 

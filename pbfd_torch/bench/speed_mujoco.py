@@ -33,7 +33,7 @@ class Peer:
         """It runs everywhere."""
         return ""
 
-    def ready(self, works: Sequence[Work], threads: int, under_way: bool = False) -> Call:
+    def ready(self, works: Sequence[Work], threads: int) -> Call:
         """What makes these rollouts, one after another; its outputs are reused."""
         from mujoco import MjData, rollout
 

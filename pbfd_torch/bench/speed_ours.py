@@ -56,16 +56,15 @@ class Ours:
             return "the core has one thread"
         return uncovered(self._simulator(1).eager)
 
-    def ready(self, works: Sequence[Work], threads: int, under_way: bool = False) -> Call:
-        """What makes these rollouts, one after another. under_way: they start in the middle of a motion, and their first step does
-        not count: a velocity that is an average over the last one makes it harder than others."""
+    def ready(self, works: Sequence[Work], threads: int) -> Call:
+        """What makes these rollouts, one after another."""
         simulator = self._simulator(len(works[0].q))
         kind = DTYPES[self.dtype]
         begun = []
         for work in works:
             controls = work.controls.to(kind)
             state = simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0])
-            begun.append((simulator.step(state, controls[0])[0] if under_way else state, controls))
+            begun.append((simulator.step(state, controls[0])[0] if work.under_way else state, controls))
         return lambda: _outcome([solution for state, controls in begun for _, solution in _steps(simulator, state, controls)])
 
     def motion(self, case: Any, duration: float, worlds: int = 1) -> Track:

@@ -22,11 +22,13 @@ SCATTER, SCATTER_SPEED = 0.05, 0.2  # of the starts [rad], [rad/s, m/s]
 @dataclass(frozen=True, eq=False)
 class Work:
     """What a contestant does in one call, in float64: q, v at the start `[worlds, nq]`, `[worlds, nv]`, and controls
-    `[steps, worlds, nu]`, each held for a control step."""
+    `[steps, worlds, nu]`, each held for a control step. under_way: it starts in the middle of a motion, and a step before the
+    first one does not count: a velocity that is an average over the last one makes it harder than others."""
 
     q: Tensor
     v: Tensor
     controls: Tensor
+    under_way: bool = False
 
     @property
     def world_steps(self) -> int:
@@ -49,6 +51,7 @@ class Course:
         steps: control steps of a timed rollout.
         worlds: batches.
         drive: random controls are the held one ± this.
+        alone: rollouts of a single world, one after another; one where nothing is random.
         shipped: least steps of MuJoCo's Runge–Kutta 4 in a control step.
         bound: error beyond which a motion of MuJoCo's is none of this scene [m].
     """
@@ -57,7 +60,8 @@ class Course:
     dt: float
     steps: int
     worlds: tuple[int, ...] = (1, 64, 1024)
-    drive: float = 1.0
+    drive: float = 0.0
+    alone: int = 1
     shipped: int = 1
     bound: float = math.inf
 
@@ -71,9 +75,14 @@ class Course:
         return SCENES[self.scene](worlds=worlds, dtype=dtype)
 
     def work(self, worlds: int) -> Work:
-        """Rollouts of that many worlds from starts scattered around the scene's own, each under random controls of its own."""
+        """Rollouts of that many worlds, the first from the scene's own start, others from starts scattered around it in all hinges
+        and slides, so that what is plane stays so; each under random controls of its own."""
         setup = self.setup(worlds)
-        q, v = scattered(setup, 0, SCATTER, SCATTER_SPEED)
+        topology = setup.scene.articulation.topology
+        moved = torch.zeros(setup.scene.articulation.nv, dtype=torch.float64)
+        moved[[start for start, size in zip(topology.v_start, topology.joint_sizes, strict=True) if size == (1, 1)]] = 1.0
+        q, v = scattered(setup, 0, SCATTER, SCATTER_SPEED, moved)
+        q[0], v[0] = setup.q[0], setup.v[0]
         held = setup.controls(self.steps)
         random = torch.Generator().manual_seed(1)
         drawn = 2 * torch.rand(held.shape, dtype=torch.float64, generator=random) - 1
@@ -87,7 +96,7 @@ def spread(work: Work, path: Track, worlds: int, groups: int, steps: int) -> Seq
 
     controls = work.controls[:steps]
     few = [torch.arange(worlds).add(group * worlds) % controls.shape[1] for group in range(groups)]
-    return [Work(*starts(path, worlds, group, groups)[:2], controls[:, index]) for group, index in enumerate(few)]
+    return [Work(*starts(path, worlds, group, groups)[:2], controls[:, index], True) for group, index in enumerate(few)]
 
 
 def first_link(track: Track) -> Tensor:
@@ -111,7 +120,7 @@ def _robot(scene: str, motors: int, drive: float) -> Course:
     title = f"{scene}: root, .4 s"
     control = _around_stance(scene, motors, 0.1)
     case = Case(scene, title, "m", 0.4, (), first_link, None, OWN, observed_s=0.4, control=control, frame=CONTROL_STEP)
-    return Course(case, CONTROL_STEP, 125, drive=drive, shipped=SHIPPED)
+    return Course(case, CONTROL_STEP, 125, drive=drive, alone=8, shipped=SHIPPED)
 
 
 _COURSES = (
