@@ -26,6 +26,8 @@ from pbfd_torch.bench.speed_scenes import COURSES, Course, Work, spread
 from pbfd_torch.bench.timing import Progress
 
 Contestant = Ours | Peer
+TRIED = 8  # worlds of MuJoCo's that must not diverge
+TRACKED = 16  # worlds whose motion short runs start from
 NOTES = (
     "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
     "thread, wall time for several; µs: of one world's control step",
@@ -50,7 +52,8 @@ class Effort:
 
     Attributes:
         scenes: that are run where none are asked for.
-        worlds: batches beyond this are left out.
+        worlds: batches, of those that the scenes have.
+        most_eager: torch is left out of batches that are larger.
         steps: control steps of a rollout, at most.
         alone: rollouts of a single world, one after another.
         rounds: at most.
@@ -62,6 +65,7 @@ class Effort:
 
     scenes: tuple[str, ...] = tuple(COURSES)
     worlds: tuple[int, ...] = (1, 64, 256, 1024)
+    most_eager: int = 1024
     steps: int = 1000
     alone: int = 8
     rounds: int = 7
@@ -82,7 +86,7 @@ class Effort:
 
 
 FULL = Effort()
-QUICK = Effort(("hopper", "chain-slope-drop"), (1, 1024), 50, 2, 2, 0.5, 0.5, 1, 0.001, 0.0005)
+QUICK = Effort(("hopper", "chain-slope-drop"), (1, 64, 1024), 64, 50, 2, 2, 0.5, 0.5, 1, 0.001, 0.0005)
 
 
 @dataclass
@@ -125,14 +129,15 @@ def measure_scene(course: Course, effort: Effort, threads: Sequence[int], peers:
         for one in contestants:
             errors[one] = _error(one, references)
             progress(1)
-        path = definition(course).path(work.of(0, 16))
+        path = definition(course).path(work.of(0, TRACKED))
         rows: list[dict[str, Any]] = []
         for count in threads:
             torch.set_num_threads(count)
             for worlds in effort.worlds_of(course):
                 turns = _measured(contestants, work, path, worlds, count, effort, progress)
-                for one, note in contestants.items():
-                    rows.append(_row(one, course, worlds, count, turns.get(one), errors[one], one.missing(count) or note))
+                for one, notes in contestants.items():
+                    note = _left_out(one, worlds, effort) or notes
+                    rows.append(_row(one, course, worlds, count, turns.get(one), errors[one], note))
         torch.set_num_threads(1)
     own = {name: {"source": found.source, "uncertainty_m": found.uncertainty} for name, found in references.items()}
     about = {"dt_s": course.dt, "steps": course.steps, "error_of": course.case.title}
@@ -147,7 +152,7 @@ def _contestants(course: Course, work: Work, peers: bool) -> Mapping[Contestant,
     """All, and what there is to say about each."""
     found: dict[Contestant, str] = {Ours(course, engine, dtype): "" for engine in ENGINES for dtype in DTYPES}
     for engine in INTEGRATORS if peers else ():
-        peer, note = fewest(course, engine, work.of(0, 64))
+        peer, note = fewest(course, engine, work.of(0, TRIED))
         found[peer] = note
     return found
 
@@ -155,10 +160,16 @@ def _contestants(course: Course, work: Work, peers: bool) -> Mapping[Contestant,
 def _error(one: Contestant, references: Mapping[str, Reference]) -> float:
     """[m]; NaN where there is no such motion."""
     case = one.course.case
-    if one.missing(1):
+    if one.missing():
         return math.nan
     track: Track = one.motion(case, min(case.duration, case.observed_s))
     return case.error(track, references[OURS if isinstance(one, Ours) else PEER].value)
+
+
+def _left_out(one: Contestant, worlds: int, effort: Effort) -> str:
+    """Why it is not timed in a batch; nothing where it is."""
+    slow = one.engine == "torch" and worlds > effort.most_eager
+    return f"not timed in more than {effort.most_eager} worlds: too slow for a quick run" if slow else one.missing()
 
 
 def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence[Work]:
@@ -202,7 +213,7 @@ def _measured(
     clock = _clock(threads)
     found: dict[Contestant, Turns] = {}
     for one in contestants:
-        if not one.missing(threads):
+        if not _left_out(one, worlds, effort):
             works = _works(one, work, worlds, effort)
             few = spread(work, path, worlds, len(works) if worlds == 1 else 1, effort.few)
             found[one] = _entered(one, works, few, threads, effort.patience_s)

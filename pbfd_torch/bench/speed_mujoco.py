@@ -12,6 +12,7 @@ import torch
 
 from pbfd_torch.bench.mujoco_runs import diverged, loaded
 from pbfd_torch.bench.precision import peer_motion
+from pbfd_torch.bench.precision_scenes import Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.speed_ours import Call, Outcome
 from pbfd_torch.bench.speed_scenes import Course, Work
@@ -22,16 +23,17 @@ SUBSTEPS = (1, 2, 4, 5, 10, 20, 25, 50, 100, 200)
 
 @dataclass(frozen=True)
 class Peer:
-    """One of MuJoCo's integrators on one scene, several steps in a control step."""
+    """One of MuJoCo's integrators on one scene, so many steps in a control step. unfit: why none would do, if so."""
 
     course: Course
     engine: str
     substeps: int
     dtype: str = "float64"
+    unfit: str = ""
 
-    def missing(self, threads: int) -> str:
-        """It runs everywhere."""
-        return ""
+    def missing(self) -> str:
+        """Why it is not timed; nothing where it is."""
+        return self.unfit
 
     def ready(self, works: Sequence[Work], threads: int) -> Call:
         """What makes these rollouts, one after another; its outputs are reused."""
@@ -48,7 +50,7 @@ class Peer:
 
         return call
 
-    def motion(self, case: Any, duration: float) -> Track:
+    def motion(self, case: Case, duration: float) -> Track:
         """The case's, from the scene's own start."""
         return peer_motion(case, INTEGRATORS[self.engine], self.course.dt / self.substeps, duration)[0]
 
@@ -90,11 +92,9 @@ def fewest(course: Course, engine: str, work: Work) -> tuple[Peer, str]:
     """That integrator with the fewest steps in a control step with which it neither diverges in the work nor ends further off than
     the course allows, and what there is to say about it."""
     least = course.shipped if engine == "mujoco-rk4" else 1
+    fails = f"diverges or ends over {course.bound:g} m off" if math.isfinite(course.bound) else "diverges"
     for count in [count for count in SUBSTEPS if count >= least]:
         peer = Peer(course, engine, count)
-        if not peer.lost(work) and not peer.wrong():
-            break
-    else:
-        return peer, f"diverges at every step from {course.dt:g} to {course.dt / count:g} s"
-    beyond = f" or ends over {course.bound:g} m off" if math.isfinite(course.bound) else ""
-    return peer, "" if count == least else f"diverges{beyond} with fewer than {count} steps of {course.dt / count:g} s"
+        if not peer.wrong() and not peer.lost(work):
+            return peer, "" if count == least else f"{fails} with fewer than {count} steps of {course.dt / count:g} s"
+    return Peer(course, engine, count, unfit=f"{fails} at every step from {course.dt:g} to {course.dt / count:g} s"), ""

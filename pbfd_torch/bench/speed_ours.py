@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.bench.precision import step_count
+from pbfd_torch.bench.precision_scenes import Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.speed_scenes import Course, Work
 from pbfd_torch.integrators.energy_momentum import Velocities
+from pbfd_torch.native.engine import Native, Torch
 from pbfd_torch.native.stepper import NativeStepper, uncovered
+from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.stepping.stepper import Stepper
 
 ENGINES = ("native", "torch")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -48,60 +52,64 @@ class Ours:
         """Steps in a control step."""
         return 1
 
-    def missing(self, threads: int) -> str:
+    def missing(self) -> str:
         """Why it cannot run; nothing where it can."""
-        if self.engine == "torch":
-            return ""
-        if threads > 1:
-            return "the core has one thread"
-        return uncovered(self._simulator(1).eager)
+        return uncovered(Simulator(self._scene(1), self.course.dt).eager) if self.engine == "native" else ""
 
     def ready(self, works: Sequence[Work], threads: int) -> Call:
         """What makes these rollouts, one after another."""
-        simulator = self._simulator(len(works[0].q))
+        simulator = self._simulator(len(works[0].q), threads)
         kind = DTYPES[self.dtype]
         begun = []
         for work in works:
             controls = work.controls.to(kind)
             state = simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0])
             begun.append((simulator.step(state, controls[0])[0] if work.under_way else state, controls))
-        return lambda: _outcome([solution for state, controls in begun for _, solution in _steps(simulator, state, controls)])
+        return lambda: _outcome([_run(simulator.stepper, state, controls)[1] for state, controls in begun])
 
-    def motion(self, case: Any, duration: float, worlds: int = 1) -> Track:
+    def motion(self, case: Case, duration: float) -> Track:
         """The case's, from the scene's own start."""
-        setup = self.course.setup(worlds)
+        setup = self.course.setup(1)
         steps, dt = step_count(duration, self.course.dt), self.course.dt
-        controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None].expand(-1, worlds))
-        drive = setup.controls(steps) if controls is None else controls
-        return self.path(Work(setup.q, setup.v, drive))
+        controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None])
+        return self.path(Work(setup.q, setup.v, setup.controls(steps) if controls is None else controls))
 
     def path(self, work: Work) -> Track:
         """Of all worlds of a work, in float64."""
-        simulator, kind = self._simulator(len(work.q)), DTYPES[self.dtype]
+        simulator, kind = self._simulator(len(work.q), 1), DTYPES[self.dtype]
         controls = work.controls.to(kind)
-        start = simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0])
-        states = [state for state, _ in _steps(simulator, start, controls)]
-        q = torch.stack([work.q, *(state.q.double() for state in states)])
-        v = torch.stack([work.v, *(state.v.double() for state in states)])
+        states, _ = _run(simulator.stepper, simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0]), controls)
+        q, v = (torch.cat((start[None], rest.double())) for start, rest in ((work.q, states.q), (work.v, states.v)))
         return Track.of_states(self.course.setup(len(work.q)).scene, self.course.dt * torch.arange(len(q), dtype=q.dtype), q, v)
 
-    def _simulator(self, worlds: int) -> Simulator[Velocities]:
-        simulator: Simulator[Velocities] = Simulator(self.course.setup(worlds, DTYPES[self.dtype]).scene, self.course.dt)
-        if self.engine == "native":
-            simulator.stepper = NativeStepper(simulator.eager)
-        return simulator
+    def _scene(self, worlds: int) -> Scene:
+        return self.course.setup(worlds, DTYPES[self.dtype]).scene
+
+    def _simulator(self, worlds: int, threads: int) -> Simulator[Velocities]:
+        engine = Native(threads) if self.engine == "native" else Torch()
+        return Simulator(self._scene(worlds), self.course.dt, engine=engine)
 
 
 def definition(course: Course) -> Ours:
     """What makes long motions of a scene in double precision: the core where it can, which is judged by PyTorch; else PyTorch."""
     native = Ours(course, "native", "float64")
-    return Ours(course, "torch", "float64") if native.missing(1) else native
+    return Ours(course, "torch", "float64") if native.missing() else native
 
 
-def _steps(simulator: Simulator[Velocities], state: Velocities, controls: Tensor) -> Iterator[tuple[Velocities, Solution]]:
+def _run(stepper: Stepper[Velocities], state: Velocities, controls: Tensor) -> tuple[Velocities, Solution]:
+    """The states after all steps, and how they were solved, `[steps, worlds, ...]`: the core makes them in one call."""
+    if isinstance(stepper, NativeStepper):
+        return stepper.run(state, controls, len(controls))
+    states, solutions = [], []
     for control in controls:
-        state, solution, _ = simulator.stepper.made(state, control)
-        yield state, solution
+        state, solution, _ = stepper.made(state, control)
+        states.append(state)
+        solutions.append(solution)
+    return mapped(_stacked, *states), mapped(_stacked, *solutions)
+
+
+def _stacked(*each: Tensor) -> Tensor:
+    return torch.stack(each)
 
 
 def _outcome(solutions: Sequence[Solution]) -> Outcome:
