@@ -16,32 +16,41 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from pbfd_torch.bench import mujoco_runs
 from pbfd_torch.bench.precision import OURS, OWN, PEER, Reference, peer_reference, reference_of
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.speed_mujoco import INTEGRATORS, Peer, fewest
-from pbfd_torch.bench.speed_ours import DTYPES, ENGINES, Call, Ours, Outcome, definition
-from pbfd_torch.bench.speed_scenes import COURSES, Course, Work, spread
+from pbfd_torch.bench.speed_ours import DTYPES, ENGINES, Call, Ours, Record, definition
+from pbfd_torch.bench.speed_scenes import COURSES, Course, Work
 from pbfd_torch.bench.timing import Progress
+from pbfd_torch.solvers.objective import Solution
 
 Contestant = Ours | Peer
 TRIED = 8  # worlds of MuJoCo's that must not diverge
 TRACKED = 16  # worlds whose motion short runs start from
 NOTES = (
-    "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
-    "thread, wall time for several; µs: of one world's control step",
-    "a rollout: every world from a start of its own near the scene's, the first from the scene's own, robots under random controls; "
-    "one world: chains from the scene's own start, robots several rollouts, one after another",
-    "ours where whole rollouts would take too long, as torch's do: a few steps from times spread evenly over them; the first step "
-    "after such a start does not count",
-    "MuJoCo: `mujoco.rollout`, all in C. It has no batch, so that more than 1024 steps of single worlds within a control step are "
-    "not timed: fewer worlds, 64 at least, stand for them. mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper "
-    "and walker. Contacts on the chains are as stiff as it takes them, those of robots as their files have them",
-    "steps: in a control step; where one of MuJoCo's does not do, the fewest with which nothing diverges",
-    "error: over one motion from the scene's own start, of each simulator against itself at a fine step (robots: the root until "
-    ".4 s under sines; chain-ground: centre of mass at .4 s, after the first impact; later the reference itself is not converged), "
-    "chain-slope-drop: against Coulomb's law after 5 s; ±: by how much the reference changed as its step was halved",
+    (
+        "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
+        "thread, wall time for several; µs: of one world's control step"
+    ),
+    (
+        "a rollout: every world from a start of its own near the scene's, the first from the scene's own, robots under random "
+        "controls; one world: chains from the scene's own start, robots several rollouts, one after another"
+    ),
+    "ours where whole rollouts would take too long, as torch's do: a few steps from states spread evenly over their time",
+    (
+        "MuJoCo: `mujoco.rollout`, all in C, contacts on the chains as stiff as it takes them, those of robots as their files have "
+        "them; mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper and walker. It has no batch: where worlds times "
+        "steps in a control step are over 1024, fewer worlds, 64 at least, stand for all"
+    ),
+    "steps: in a control step; on chains the fewest with which MuJoCo does not diverge, nor end too far off",
+    (
+        "error: over one motion from the scene's own start, of each simulator against itself at a fine step (robots: the root "
+        "until .4 s under sines; chain-ground: centre of mass at .4 s, after an impact; later no reference is converged), on "
+        "chain-slope-drop against Coulomb's law after 5 s; ±: by how much the reference changed as its step was halved"
+    ),
     "warm-up: from nothing until the first step, and by how much the first run took longer than the best",
 )
 
@@ -53,7 +62,7 @@ class Effort:
     Attributes:
         scenes: that are run where none are asked for.
         worlds: batches, of those that the scenes have.
-        most_eager: torch is left out of batches that are larger.
+        most_eager: torch is left out where there are more worlds times threads.
         steps: control steps of a rollout, at most.
         alone: rollouts of a single world, one after another.
         rounds: at most.
@@ -65,7 +74,7 @@ class Effort:
 
     scenes: tuple[str, ...] = tuple(COURSES)
     worlds: tuple[int, ...] = (1, 64, 256, 1024)
-    most_eager: int = 1024
+    most_eager: int = 10**9
     steps: int = 1000
     alone: int = 8
     rounds: int = 7
@@ -96,18 +105,23 @@ class Turns:
     call: Call
     world_steps: int
     ready_s: float
-    outcome: Outcome = field(default_factory=Outcome)
+    solutions: Sequence[Solution] = ()
     times: list[float] = field(default_factory=list)
 
     def take(self, clock: Callable[[], float]) -> None:
         """One more."""
         began = clock()
-        self.outcome = self.call()
+        self.solutions = self.call()
         self.times.append(clock() - began)
 
     @property
     def warmup_s(self) -> float:
+        """See `NOTES`."""
         return self.ready_s + self.times[0] - min(self.times)
+
+    def mean(self, of: Callable[[Solution], Tensor]) -> float:
+        """Over all steps of a call; NaN where nothing is known of them."""
+        return float(torch.stack([of(x).double().mean() for x in self.solutions]).mean()) if self.solutions else math.nan
 
 
 def all_threads() -> tuple[int, ...]:
@@ -129,14 +143,14 @@ def measure_scene(course: Course, effort: Effort, threads: Sequence[int], peers:
         for one in contestants:
             errors[one] = _error(one, references)
             progress(1)
-        path = definition(course).path(work.of(0, TRACKED))
+        record = definition(course).record(work.of(0, TRACKED))
         rows: list[dict[str, Any]] = []
         for count in threads:
             torch.set_num_threads(count)
             for worlds in effort.worlds_of(course):
-                turns = _measured(contestants, work, path, worlds, count, effort, progress)
+                turns = _measured(contestants, work, record, worlds, count, effort, progress)
                 for one, notes in contestants.items():
-                    note = _left_out(one, worlds, effort) or notes
+                    note = _left_out(one, worlds, count, effort) or notes
                     rows.append(_row(one, course, worlds, count, turns.get(one), errors[one], note))
         torch.set_num_threads(1)
     own = {name: {"source": found.source, "uncertainty_m": found.uncertainty} for name, found in references.items()}
@@ -166,10 +180,10 @@ def _error(one: Contestant, references: Mapping[str, Reference]) -> float:
     return case.error(track, references[OURS if isinstance(one, Ours) else PEER].value)
 
 
-def _left_out(one: Contestant, worlds: int, effort: Effort) -> str:
+def _left_out(one: Contestant, worlds: int, threads: int, effort: Effort) -> str:
     """Why it is not timed in a batch; nothing where it is."""
-    slow = one.engine == "torch" and worlds > effort.most_eager
-    return f"not timed in more than {effort.most_eager} worlds: too slow for a quick run" if slow else one.missing()
+    slow = one.engine == "torch" and worlds * threads > effort.most_eager
+    return f"quick: not timed where worlds times threads are over {effort.most_eager}" if slow else one.missing()
 
 
 def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence[Work]:
@@ -179,14 +193,14 @@ def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence
     return [work.of(0, worlds if isinstance(one, Ours) else min(worlds, max(64, 1024 // one.substeps)))]
 
 
-def _entered(one: Contestant, works: Sequence[Work], few: Sequence[Work], threads: int, patience_s: float) -> Turns:
-    """A contestant of ours makes a few steps first, and no more if the whole works would take longer than `patience_s`."""
-    clock = _clock(threads)
+def _entered(one: Contestant, works: Sequence[Work], record: Record, threads: int, effort: Effort) -> Turns:
+    """A contestant of ours makes a few steps first, and no more if all of them would take too long."""
     began = time.perf_counter()
     if isinstance(one, Ours):
-        turns = Turns(one.ready(few, threads), _world_steps(few), time.perf_counter() - began)
-        turns.take(clock)
-        if turns.times[0] * _world_steps(works) / turns.world_steps > patience_s:
+        call = one.ready_under_way(record, len(works[0].q), len(works), effort.few, threads)
+        turns = Turns(call, effort.few * sum(len(x.q) for x in works), time.perf_counter() - began)
+        turns.take(_clock(threads))
+        if turns.times[0] * _world_steps(works) / turns.world_steps > effort.patience_s:
             return turns
         began = time.perf_counter()
     return Turns(one.ready(works, threads), _world_steps(works), time.perf_counter() - began)
@@ -203,7 +217,7 @@ def _clock(threads: int) -> Callable[[], float]:
 def _measured(
     contestants: Mapping[Contestant, str],
     work: Work,
-    path: Track,
+    record: Record,
     worlds: int,
     threads: int,
     effort: Effort,
@@ -213,14 +227,13 @@ def _measured(
     clock = _clock(threads)
     found: dict[Contestant, Turns] = {}
     for one in contestants:
-        if not _left_out(one, worlds, effort):
+        if not _left_out(one, worlds, threads, effort):
             works = _works(one, work, worlds, effort)
-            few = spread(work, path, worlds, len(works) if worlds == 1 else 1, effort.few)
-            found[one] = _entered(one, works, few, threads, effort.patience_s)
+            found[one] = _entered(one, works, record, threads, effort)
         progress(1)
     for _ in range(effort.rounds):
         for turns in found.values():
-            if sum(turns.times) < effort.enough_s:
+            if not turns.times or sum(turns.times) < effort.enough_s:
                 turns.take(clock)
     return found
 
@@ -229,8 +242,8 @@ def _row(
     one: Contestant, course: Course, worlds: int, threads: int, turns: Turns | None, error: float, note: str
 ) -> dict[str, Any]:
     """One line; without numbers where there is nothing to measure."""
-    seconds = math.nan if turns is None else min(turns.times) / turns.world_steps
-    outcome = Outcome() if turns is None else turns.outcome
+    took = turns or Turns(tuple, 1, math.nan, times=[math.nan])
+    seconds = min(took.times) / took.world_steps
     return {
         "scene": course.scene,
         "engine": one.engine,
@@ -243,11 +256,11 @@ def _row(
         "physics_steps_per_s": one.substeps / seconds,
         "us_per_step": 1e6 * seconds,
         "ms_per_simulated_s": 1e3 * seconds / course.dt,
-        "evaluations_mean": outcome.evaluations,
-        "solved_share": outcome.solved,
-        "fallback_share": outcome.fallbacks,
+        "evaluations_mean": took.mean(lambda x: x.evaluations),
+        "solved_share": took.mean(lambda x: x.solved),
+        "fallback_share": took.mean(lambda x: x.fallbacks.sum(-1) > 0),
         "error_m": error,
-        "warmup_s": math.nan if turns is None else turns.warmup_s,
+        "warmup_s": took.warmup_s,
         "timed_world_steps": 0 if turns is None else turns.world_steps,
         "note": note,
     }

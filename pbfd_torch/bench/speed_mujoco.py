@@ -14,11 +14,12 @@ from pbfd_torch.bench.mujoco_runs import diverged, loaded
 from pbfd_torch.bench.precision import peer_motion
 from pbfd_torch.bench.precision_scenes import Case
 from pbfd_torch.bench.precision_tracks import Track
-from pbfd_torch.bench.speed_ours import Call, Outcome
+from pbfd_torch.bench.speed_ours import Call
 from pbfd_torch.bench.speed_scenes import Course, Work
+from pbfd_torch.solvers.objective import Solution
 
 INTEGRATORS = {"mujoco-implicitfast": "implicitfast", "mujoco-discrete": "discrete", "mujoco-rk4": "RK4"}
-SUBSTEPS = (1, 2, 4, 5, 10, 20, 25, 50, 100, 200)
+SUBSTEPS = (1, 2, 4, 5, 10, 20, 25, 50, 100)
 
 
 @dataclass(frozen=True)
@@ -43,10 +44,10 @@ class Peer:
         datas = [MjData(model) for _ in range(threads)]
         arguments = [self._arguments(model, datas[0], work) for work in works]
 
-        def call() -> Outcome:
+        def call() -> Sequence[Solution]:
             for start, controls, states in arguments:
                 rollout.rollout(model, datas, start, controls, nstep=states.shape[1], state=states, persistent_pool=threads > 1)
-            return Outcome()
+            return ()
 
         return call
 

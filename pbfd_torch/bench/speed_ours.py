@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,22 +20,30 @@ from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.stepper import Stepper
+from pbfd_torch.tensors.structures import in_dtype
 
 ENGINES = ("native", "torch")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How the steps of a call went, over all of them: evaluations a step, the share solved, the share with a fallback; NaN: not
-    known."""
-
-    evaluations: float = math.nan
-    solved: float = math.nan
-    fallbacks: float = math.nan
+Call = Callable[[], Sequence[Solution]]
+"""Makes rollouts and says how their steps were solved, as far as that is known."""
 
 
-Call = Callable[[], Outcome]
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The states of rollouts after each step `[steps, worlds, ...]`, and their controls."""
+
+    states: Velocities
+    controls: Tensor
+
+    def spread(self, worlds: int, group: int, groups: int, steps: int) -> tuple[Velocities, Tensor]:
+        """Of one of `groups` groups: states at times that are, of all groups together, spread evenly, and controls for so many
+        steps."""
+        count, tracked = self.states.q.shape[:2]
+        world = torch.arange(worlds)
+        row, copy = (group + groups * world) * count // (groups * worlds), (group + groups * world) % tracked
+        return mapped(lambda x: x[row, copy], self.states), self.controls[:steps, copy]
 
 
 @dataclass(frozen=True)
@@ -59,13 +66,15 @@ class Ours:
     def ready(self, works: Sequence[Work], threads: int) -> Call:
         """What makes these rollouts, one after another."""
         simulator = self._simulator(len(works[0].q), threads)
-        kind = DTYPES[self.dtype]
-        begun = []
-        for work in works:
-            controls = work.controls.to(kind)
-            state = simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0])
-            begun.append((simulator.step(state, controls[0])[0] if work.under_way else state, controls))
-        return lambda: _outcome([_run(simulator.stepper, state, controls)[1] for state, controls in begun])
+        begun = [self._begun(simulator, work) for work in works]
+        return lambda: [_run(simulator.stepper, state, controls)[1] for state, controls in begun]
+
+    def ready_under_way(self, record: Record, worlds: int, groups: int, steps: int, threads: int) -> Call:
+        """What stands for rollouts that would take too long: a few steps of so many groups of worlds, one after another, each world
+        from a state of the record at another time, spread evenly over it."""
+        simulator, kind = self._simulator(worlds, threads), DTYPES[self.dtype]
+        begun = [in_dtype(record.spread(worlds, group, groups, steps), kind) for group in range(groups)]
+        return lambda: [_run(simulator.stepper, state, controls)[1] for state, controls in begun]
 
     def motion(self, case: Case, duration: float) -> Track:
         """The case's, from the scene's own start."""
@@ -76,11 +85,19 @@ class Ours:
 
     def path(self, work: Work) -> Track:
         """Of all worlds of a work, in float64."""
-        simulator, kind = self._simulator(len(work.q), 1), DTYPES[self.dtype]
-        controls = work.controls.to(kind)
-        states, _ = _run(simulator.stepper, simulator.initial_state(work.q.to(kind), work.v.to(kind), controls[0]), controls)
+        states = self.record(work).states
         q, v = (torch.cat((start[None], rest.double())) for start, rest in ((work.q, states.q), (work.v, states.v)))
         return Track.of_states(self.course.setup(len(work.q)).scene, self.course.dt * torch.arange(len(q), dtype=q.dtype), q, v)
+
+    def record(self, work: Work) -> Record:
+        """All states of a work."""
+        simulator = self._simulator(len(work.q), 1)
+        state, controls = self._begun(simulator, work)
+        return Record(_run(simulator.stepper, state, controls)[0], controls)
+
+    def _begun(self, simulator: Simulator[Velocities], work: Work) -> tuple[Velocities, Tensor]:
+        q, v, controls = (x.to(DTYPES[self.dtype]) for x in (work.q, work.v, work.controls))
+        return simulator.initial_state(q, v, controls[0]), controls
 
     def _scene(self, worlds: int) -> Scene:
         return self.course.setup(worlds, DTYPES[self.dtype]).scene
@@ -110,10 +127,3 @@ def _run(stepper: Stepper[Velocities], state: Velocities, controls: Tensor) -> t
 
 def _stacked(*each: Tensor) -> Tensor:
     return torch.stack(each)
-
-
-def _outcome(solutions: Sequence[Solution]) -> Outcome:
-    def mean(of: Callable[[Solution], Tensor]) -> float:
-        return float(torch.stack([of(x).double().mean() for x in solutions]).mean())
-
-    return Outcome(mean(lambda x: x.evaluations), mean(lambda x: x.solved), mean(lambda x: x.fallbacks.sum(-1) > 0))

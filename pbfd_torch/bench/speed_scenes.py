@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -22,13 +22,11 @@ SCATTER, SCATTER_SPEED = 0.05, 0.2  # of the starts [rad], [rad/s, m/s]
 @dataclass(frozen=True, eq=False)
 class Work:
     """What a contestant does in one call, in float64: q, v at the start `[worlds, nq]`, `[worlds, nv]`, and controls
-    `[steps, worlds, nu]`, each held for a control step. under_way: it starts in the middle of a motion, and a step before the
-    first one does not count: a velocity that is an average over the last one makes it harder than others."""
+    `[steps, worlds, nu]`, each held for a control step."""
 
     q: Tensor
     v: Tensor
     controls: Tensor
-    under_way: bool = False
 
     @property
     def world_steps(self) -> int:
@@ -87,16 +85,6 @@ class Course:
         random = torch.Generator().manual_seed(1)
         drawn = 2 * torch.rand(held.shape, dtype=torch.float64, generator=random) - 1
         return Work(q, v, held + self.drive * drawn)
-
-
-def spread(work: Work, path: Track, worlds: int, groups: int, steps: int) -> Sequence[Work]:
-    """What stands for the whole work where that would take too long: so many groups of worlds, each starting from another time of
-    its motion, spread evenly over it, and making a few steps."""
-    from pbfd_torch.bench.precision import starts
-
-    controls = work.controls[:steps]
-    few = [torch.arange(worlds).add(group * worlds) % controls.shape[1] for group in range(groups)]
-    return [Work(*starts(path, worlds, group, groups)[:2], controls[:, index], True) for group, index in enumerate(few)]
 
 
 def first_link(track: Track) -> Tensor:

@@ -18,18 +18,13 @@ def finite(value: float | None) -> bool:
 
 
 def ratios(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Of every batch of ours that was timed in the core: how many times as many control steps a second as the others make of the
-    same batch with as many threads (torch in the same dtype, MuJoCo in double), and which of MuJoCo's is the fastest."""
+    """Of every batch that was timed in the core: how many times as many control steps a second as the others make of the same
+    batch with as many threads (torch in the same dtype, MuJoCo in double), and which of MuJoCo's is the fastest."""
+    timed = [row for row in rows if finite(row["control_steps_per_s"])]
     found = []
-    for row in rows:
-        if row["engine"] != "native" or not finite(row["control_steps_per_s"]):
-            continue
-        same = [x for x in rows if all(x[key] == row[key] for key in ("scene", "worlds", "threads"))]
-        others = {
-            x["engine"]: x
-            for x in same
-            if finite(x["control_steps_per_s"]) and (x["engine"] in PEERS or (x["engine"] == "torch" and x["dtype"] == row["dtype"]))
-        }
+    for row in (row for row in timed if row["engine"] == "native"):
+        same = [x for x in timed if all(x[key] == row[key] for key in ("scene", "worlds", "threads"))]
+        others = {x["engine"]: x for x in same if x["engine"] in PEERS or (x["engine"], x["dtype"]) == ("torch", row["dtype"])}
         best = min((others[name] for name in PEERS if name in others), key=lambda x: float(x["us_per_step"]), default=None)
         found.append({
             **{key: row[key] for key in ("scene", "worlds", "threads", "dtype", "ms_per_simulated_s")},
@@ -50,7 +45,7 @@ def ratio_lines(found: Sequence[Row], threads: int = 1) -> list[list[str]]:
             *(row["scene"], str(row["worlds"]), row["dtype"]),
             *(_number(row["times_as_fast_as"].get(name)) for name in (*PEERS, "torch")),
             _number(row["ms_per_simulated_s"]),
-            "–" if row["fastest_mujoco"] is None else f"{_number(row['fastest_mujoco_ms_per_simulated_s'])} ({row['fastest_mujoco']})",
+            " ".join((_number(row["fastest_mujoco_ms_per_simulated_s"]), row["fastest_mujoco"] or "")).strip(),
         ]
         for row in found
         if row["threads"] == threads
