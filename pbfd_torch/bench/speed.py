@@ -74,13 +74,13 @@ class Effort:
 
     scenes: tuple[str, ...] = tuple(COURSES)
     worlds: tuple[int, ...] = (1, 64, 256, 1024)
-    most_eager: int = 10**9
+    most_eager: int = 1024
     steps: int = 1000
     alone: int = 8
     rounds: int = 7
-    enough_s: float = 3.0
-    patience_s: float = 6.0
-    few: int = 3
+    enough_s: float = 2.0
+    patience_s: float = 5.0
+    few: int = 2
     own_step: float = 0.0005
     own_peer_step: float = 0.0001
 
@@ -183,7 +183,7 @@ def _error(one: Contestant, references: Mapping[str, Reference]) -> float:
 def _left_out(one: Contestant, worlds: int, threads: int, effort: Effort) -> str:
     """Why it is not timed in a batch; nothing where it is."""
     slow = one.engine == "torch" and worlds * threads > effort.most_eager
-    return f"quick: not timed where worlds times threads are over {effort.most_eager}" if slow else one.missing()
+    return f"not timed where worlds times threads are over {effort.most_eager}" if slow else one.missing()
 
 
 def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence[Work]:

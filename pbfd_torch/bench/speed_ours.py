@@ -86,7 +86,9 @@ class Ours:
     def path(self, work: Work) -> Track:
         """Of all worlds of a work, in float64."""
         states = self.record(work).states
-        q, v = (torch.cat((start[None], rest.double())) for start, rest in ((work.q, states.q), (work.v, states.v)))
+        simulator = self._simulator(len(work.q), 1)
+        speed = simulator.integrator.velocity(simulator.articulation, states, simulator.step_size)
+        q, v = (torch.cat((start[None], rest.double())) for start, rest in ((work.q, states.q), (work.v, speed)))
         return Track.of_states(self.course.setup(len(work.q)).scene, self.course.dt * torch.arange(len(q), dtype=q.dtype), q, v)
 
     def record(self, work: Work) -> Record:

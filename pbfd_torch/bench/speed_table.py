@@ -52,25 +52,35 @@ def ratio_lines(found: Sequence[Row], threads: int = 1) -> list[list[str]]:
     ]
 
 
-def scene_headers(rows: Sequence[Row]) -> list[str]:
-    """Of `scene_lines`."""
-    return [
-        *("engine", "dtype", "steps"),
-        *(f"1000/s, {worlds} w." if threads == 1 else f"{worlds} w., {threads} thr." for worlds, threads in _batches(rows)),
-        *("µs", "evaluations", "solved", "fallbacks", "error [m]", "warm-up [s]"),
-    ]
+Batch = tuple[int, int]
+"""Worlds and threads."""
 
 
-def scene_lines(rows: Sequence[Row]) -> list[list[str]]:
+def batches(rows: Sequence[Row]) -> list[Batch]:
+    """What all scenes were timed in: numbers of worlds with one thread, and the largest of them with more."""
+    scenes = dict.fromkeys(row["scene"] for row in rows)
+    worlds = sorted(set.intersection(*({row["worlds"] for row in rows if row["scene"] == name} for name in scenes)))
+    threads = sorted({row["threads"] for row in rows})
+    return [(count, 1) for count in worlds] + [(worlds[-1], count) for count in threads if count > 1]
+
+
+def contestant_headers(shown: Sequence[Batch]) -> list[str]:
+    """Of `contestant_lines`."""
+    rates = (f"{worlds} w., {threads} thr." if threads > 1 else f"{worlds} w." for worlds, threads in shown)
+    return ["engine", "dtype", "steps", *rates, "µs", "evaluations", "solved", "fallbacks", "error [m]", "warm-up [s]"]
+
+
+def contestant_lines(rows: Sequence[Row], shown: Sequence[Batch]) -> list[list[str]]:
     """One line for each contestant of a scene: thousands of control steps a second in each batch, and the rest of the largest one
     with one thread."""
+    largest = max(worlds for worlds, threads in shown if threads == 1)
     lines = []
     for engine, dtype in dict.fromkeys((row["engine"], row["dtype"]) for row in rows):
         mine = {(row["worlds"], row["threads"]): row for row in rows if (row["engine"], row["dtype"]) == (engine, dtype)}
-        last = mine[max(worlds for worlds, threads in mine if threads == 1), 1]
+        last = mine[largest, 1]
         lines.append([
             *(engine, dtype, str(last["substeps"])),
-            *(_number(mine[batch]["control_steps_per_s"] / 1e3) for batch in _batches(rows)),
+            *(_number(mine[batch]["control_steps_per_s"] / 1e3) for batch in shown),
             *(_number(last[key]) for key in ("us_per_step", "evaluations_mean", "solved_share", "fallback_share")),
             *(_number(last[key], 2) for key in ("error_m", "warmup_s")),
         ])  # fmt: skip
@@ -80,13 +90,6 @@ def scene_lines(rows: Sequence[Row]) -> list[list[str]]:
 def remarks(rows: Sequence[Row]) -> list[str]:
     """What there is to say of single rows, once each."""
     return list(dict.fromkeys(f"{row['engine']} {row['dtype']}: {row['note']}" for row in rows if row["note"]))
-
-
-def _batches(rows: Sequence[Row]) -> list[tuple[int, int]]:
-    """Numbers of worlds with one thread, and the largest of them with all."""
-    worlds = sorted({row["worlds"] for row in rows})
-    threads = sorted({row["threads"] for row in rows})
-    return [(count, 1) for count in worlds] + [(worlds[-1], count) for count in threads if count > 1]
 
 
 def _number(value: float | None, digits: int = 3) -> str:
@@ -102,20 +105,24 @@ _COLUMNS = (
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The whole report: ratios, notes, every row."""
-    about = report["environment"]
+    """The whole report: ratios, an overview, notes, every row."""
+    about, rows = report["environment"], report["rows"]
     peer = f"MuJoCo {about['mujoco']}" if about["mujoco"] else "no MuJoCo"
+    of = {name: [row for row in rows if row["scene"] == name] for name in report["scenes"]}
+    shown = batches(rows)
+    overview = [[name, *line] for name, mine in of.items() for line in contestant_lines(mine, shown)]
     parts = [
         "# Speed",
         f"PyTorch {about['torch']}, {peer}, native core {about['native'] or 'missing'}, {about['processor']}.",
-        "## How many times as fast, one thread",
+        "## How many times as fast the core is, one thread",
         _table(RATIO_HEADERS, ratio_lines(report["ratios"])),
+        "## Thousands of control steps a second",
+        _table(["scene", *contestant_headers(shown)], overview),
         "\n".join(f"- {note}" for note in report["notes"]),
     ]
     for name, scene in report["scenes"].items():
-        rows = [row for row in report["rows"] if row["scene"] == name]
         parts += [f"## {name}", heading(name, scene) + "."]
-        parts.append(_table(_COLUMNS, [[_cell(row[key]) for key in _COLUMNS] for row in rows]))
+        parts.append(_table(_COLUMNS, [[_cell(row[key]) for key in _COLUMNS] for row in of[name]]))
     return "\n\n".join(parts) + "\n"
 
 

@@ -96,15 +96,24 @@ def write(report: dict[str, Any], folder: Path) -> None:
 
 def print_report(report: dict[str, Any], folder: Path) -> None:
     """A table for each scene, the ratios, notes, and where the files are."""
-    from pbfd_torch.bench.speed_table import RATIO_HEADERS, heading, ratio_lines, remarks, scene_headers, scene_lines
+    from pbfd_torch.bench.speed_table import (
+        RATIO_HEADERS,
+        batches,
+        contestant_headers,
+        contestant_lines,
+        heading,
+        ratio_lines,
+        remarks,
+    )
 
     console = Console(markup=False, emoji=False)
     for name, scene in report["scenes"].items():
         rows = [row for row in report["rows"] if row["scene"] == name]
-        shown = new_table(heading(name, scene), *scene_headers(rows))
-        for line in scene_lines(rows):
-            shown.add_row(*line)
-        console.print(shown, *(f"- {remark}" for remark in remarks(rows)), "", sep="\n")
+        shown = batches(rows)
+        table = new_table(f"{heading(name, scene)}; thousands of control steps a second", *contestant_headers(shown))
+        for line in contestant_lines(rows, shown):
+            table.add_row(*line)
+        console.print(table, *(f"- {remark}" for remark in remarks(rows)), "", sep="\n")
     summary = new_table("The core's control steps a second over those of …, same worlds, one thread", *RATIO_HEADERS)
     for line in ratio_lines(report["ratios"]):
         summary.add_row(*line)
