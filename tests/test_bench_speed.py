@@ -35,7 +35,8 @@ TINY = Effort(("hopper",), (1, 3), 3, 4, 2, 1, 0.0, 1e9, 1, 0.004, 0.002)
 
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The quick run with four steps of one world and of three, whose error is that after ten."""
+    """The quick run with four steps of one world and of three, whose error is that after ten; one thread."""
+    monkeypatch.setattr(speed, "all_threads", lambda: (1,))
     monkeypatch.setattr(speed, "QUICK", TINY)
     monkeypatch.setitem(COURSES, "hopper", SHORT)  # type: ignore[arg-type]
 
@@ -156,13 +157,25 @@ def test_what_is_not_covered_has_a_row_that_says_why(monkeypatch: pytest.MonkeyP
 def test_what_takes_too_long_makes_a_few_steps() -> None:
     """And torch is left out of the largest batches."""
     course = replace(SHORT, worlds=(3,))
-    hurried = replace(TINY, patience_s=0.0, few=2, most_eager=2)
+    hurried = replace(TINY, patience_s=0.0, few=6, most_eager=2)
     found = measure_scene(course, hurried, (1,), False, lambda _: None)
     for row in found["rows"]:
         if row["engine"] == "torch":
             assert row["note"] == "not timed where worlds times threads are over 2"
         elif not row["note"]:
             assert row["timed_world_steps"] == 6
+
+
+def test_several_threads() -> None:
+    """Rows of one thread and of two; who is timed by wall time and who by CPU time is no matter of the rows."""
+    course = replace(SHORT, worlds=(3,))
+    found = measure_scene(course, replace(TINY, most_eager=3), (1, 2), True, lambda _: None)
+    rows = {(row["engine"], row["threads"]): row for row in found["rows"]}
+    assert rows["torch", 1]["note"] == ""
+    assert rows["torch", 2]["note"] == "not timed where worlds times threads are over 3"
+    assert rows["mujoco-discrete", 2]["control_steps_per_s"] > 0
+    assert rows["native", 2]["note"] or rows["native", 2]["control_steps_per_s"] > 0
+    assert speed.all_threads()[0] == 1
 
 
 def test_errors_are_those_of_their_steps() -> None:

@@ -30,6 +30,7 @@ from pbfd_torch.solvers.objective import Solution
 Contestant = Ours | Peer
 TRIED = 8  # worlds of MuJoCo's that must not diverge
 TRACKED = 16  # worlds whose motion short runs start from
+GROUPS = 8  # times of it that those of a single world start from
 NOTES = (
     (
         "control steps/s: of all worlds together, the best of several rounds in which the contestants take turns; CPU time for one "
@@ -68,7 +69,7 @@ class Effort:
         rounds: at most.
         enough_s: a contestant that has taken this long takes no further turn.
         patience_s: ours whose rollouts would take longer makes a few steps instead.
-        few: how many.
+        few: of single worlds in all; one of each at least.
         own_step, own_peer_step: [s] of the motions that serve as references.
     """
 
@@ -80,7 +81,7 @@ class Effort:
     rounds: int = 7
     enough_s: float = 2.0
     patience_s: float = 5.0
-    few: int = 2
+    few: int = 128
     own_step: float = 0.0005
     own_peer_step: float = 0.0001
 
@@ -95,7 +96,7 @@ class Effort:
 
 
 FULL = Effort()
-QUICK = Effort(("hopper", "chain-slope-drop"), (1, 64, 1024), 64, 50, 2, 2, 0.5, 0.5, 1, 0.001, 0.0005)
+QUICK = Effort(("hopper", "chain-slope-drop"), (1, 64, 1024), 64, 50, 2, 2, 0.5, 0.5, 16, 0.001, 0.0005)
 
 
 @dataclass
@@ -197,8 +198,11 @@ def _entered(one: Contestant, works: Sequence[Work], record: Record, threads: in
     """A contestant of ours makes a few steps first, and no more if all of them would take too long."""
     began = time.perf_counter()
     if isinstance(one, Ours):
-        call = one.ready_under_way(record, len(works[0].q), len(works), effort.few, threads)
-        turns = Turns(call, effort.few * sum(len(x.q) for x in works), time.perf_counter() - began)
+        worlds = len(works[0].q)
+        groups = GROUPS if worlds == 1 else 1
+        steps = max(1, min(one.course.steps, effort.few // (groups * worlds)))
+        call = one.ready_under_way(record, worlds, groups, steps, threads)
+        turns = Turns(call, groups * worlds * steps, time.perf_counter() - began)
         turns.take(_clock(threads))
         if turns.times[0] * _world_steps(works) / turns.world_steps > effort.patience_s:
             return turns
