@@ -30,6 +30,7 @@ from pbfd_torch.solvers.objective import Solution
 Contestant = Ours | Peer
 TRIED = 8  # worlds of MuJoCo's that must not diverge
 TRACKED = 16  # worlds whose motion short runs start from
+PEERS = 64  # worlds that stand for a batch of MuJoCo's, at least
 GROUPS = 8  # times of it that those of a single world start from
 NOTES = (
     (
@@ -43,8 +44,8 @@ NOTES = (
     "ours where whole rollouts would take too long, as torch's do: a few steps from states spread evenly over their time",
     (
         "MuJoCo: `mujoco.rollout`, all in C, contacts on the chains as stiff as it takes them, those of robots as their files have "
-        "them; mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper and walker. It has no batch: where worlds times "
-        "steps in a control step are over 1024, fewer worlds, 64 at least, stand for all"
+        "them; mujoco-rk4: four steps of 2 ms on robots, as Gymnasium ships hopper and walker. It has no batch: where all worlds "
+        "would take too long, fewer, 64 at least, stand for them"
     ),
     "steps: in a control step; on chains the fewest with which MuJoCo does not diverge, nor end too far off",
     (
@@ -68,8 +69,8 @@ class Effort:
         alone: rollouts of a single world, one after another.
         rounds: at most.
         enough_s: a contestant that has taken this long takes no further turn.
-        patience_s: ours whose rollouts would take longer makes a few steps instead.
-        few: of single worlds in all; one of each at least.
+        patience_s: where rollouts would take longer, less stands for them: of ours few steps, of MuJoCo's fewer worlds.
+        few: steps of single worlds, in all; one of each at least.
         own_step, own_peer_step: [s] of the motions that serve as references.
     """
 
@@ -187,27 +188,27 @@ def _left_out(one: Contestant, worlds: int, threads: int, effort: Effort) -> str
     return f"not timed where worlds times threads are over {effort.most_eager}" if slow else one.missing()
 
 
-def _works(one: Contestant, work: Work, worlds: int, effort: Effort) -> Sequence[Work]:
-    """What a contestant does in one turn."""
-    if worlds == 1:
-        return [work.of(k, 1) for k in range(min(one.course.alone, effort.alone))]
-    return [work.of(0, worlds if isinstance(one, Ours) else min(worlds, max(64, 1024 // one.substeps)))]
-
-
-def _entered(one: Contestant, works: Sequence[Work], record: Record, threads: int, effort: Effort) -> Turns:
-    """A contestant of ours makes a few steps first, and no more if all of them would take too long."""
+def _entered(one: Contestant, work: Work, record: Record, worlds: int, threads: int, effort: Effort) -> Turns:
+    """A contestant with what it does in its turns: the whole work, or less where that would take too long. Ours then makes few
+    steps of all worlds; of MuJoCo's, which knows no batch, fewer worlds stand for all."""
+    whole = [work.of(k, 1) for k in range(min(one.course.alone, effort.alone))] if worlds == 1 else [work.of(0, worlds)]
     began = time.perf_counter()
     if isinstance(one, Ours):
-        worlds = len(works[0].q)
         groups = GROUPS if worlds == 1 else 1
         steps = max(1, min(one.course.steps, effort.few // (groups * worlds)))
         call = one.ready_under_way(record, worlds, groups, steps, threads)
-        turns = Turns(call, groups * worlds * steps, time.perf_counter() - began)
-        turns.take(_clock(threads))
-        if turns.times[0] * _world_steps(works) / turns.world_steps > effort.patience_s:
-            return turns
-        began = time.perf_counter()
-    return Turns(one.ready(works, threads), _world_steps(works), time.perf_counter() - began)
+        first = Turns(call, groups * worlds * steps, time.perf_counter() - began)
+    else:
+        part = [work.of(0, min(worlds, PEERS))]
+        first = Turns(one.ready(part, threads), _world_steps(part), time.perf_counter() - began)
+    first.take(_clock(threads))
+    most = effort.patience_s / first.times[0] * first.world_steps
+    if most < _world_steps(whole):
+        if isinstance(one, Ours) or worlds <= PEERS:
+            return first
+        whole = [work.of(0, max(PEERS, int(most / len(work.controls))))]
+    began = time.perf_counter()
+    return Turns(one.ready(whole, threads), _world_steps(whole), time.perf_counter() - began)
 
 
 def _world_steps(works: Sequence[Work]) -> int:
@@ -232,8 +233,7 @@ def _measured(
     found: dict[Contestant, Turns] = {}
     for one in contestants:
         if not _left_out(one, worlds, threads, effort):
-            works = _works(one, work, worlds, effort)
-            found[one] = _entered(one, works, record, threads, effort)
+            found[one] = _entered(one, work, record, worlds, threads, effort)
         progress(1)
     for _ in range(effort.rounds):
         for turns in found.values():
