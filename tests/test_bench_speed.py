@@ -38,7 +38,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     """The quick run with four steps of one world and of three, whose error is that after ten; one thread."""
     monkeypatch.setattr(speed, "all_threads", lambda: (1,))
     monkeypatch.setattr(speed, "QUICK", TINY)
-    monkeypatch.setitem(COURSES, "hopper", SHORT)  # type: ignore[arg-type]
+    monkeypatch.setitem(COURSES, "hopper", SHORT)
 
 
 # the work -----------------------------------------------------------------------------------------------------------------
