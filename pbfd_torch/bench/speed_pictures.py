@@ -43,7 +43,7 @@ def draw(report: Mapping[str, Any], path: Path) -> None:
     handles = [Line2D([], [], label=" ".join(key), markersize=5, **style) for key, style in STYLES.items()]
     handles.append(Line2D([], [], color="0.3", linestyle="--", alpha=0.5, label="all threads"))
     handles.append(Line2D([], [], color="0.6", linestyle=":", label="± of a reference of its own"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(5, 2 + len(names)), frameon=False)
     figure.suptitle("Control steps a second over worlds, and error beside the time of a step, one thread", fontsize=13)
     write_figure(path, figure)
     plt.close(figure)

@@ -72,12 +72,12 @@ def contestant_headers(shown: Sequence[Batch]) -> list[str]:
 
 def contestant_lines(rows: Sequence[Row], shown: Sequence[Batch]) -> list[list[str]]:
     """One line for each contestant of a scene: thousands of control steps a second in each batch, and the rest of the largest one
-    with one thread."""
-    largest = max(worlds for worlds, threads in shown if threads == 1)
+    that it was timed in with one thread."""
     lines = []
     for engine, dtype in dict.fromkeys((row["engine"], row["dtype"]) for row in rows):
         mine = {(row["worlds"], row["threads"]): row for row in rows if (row["engine"], row["dtype"]) == (engine, dtype)}
-        last = mine[largest, 1]
+        alone = [row for row in mine.values() if row["threads"] == 1]
+        last = max(alone, key=lambda row: (finite(row["control_steps_per_s"]), row["worlds"]))
         lines.append([
             *(engine, dtype, str(last["substeps"])),
             *(_number(mine[batch]["control_steps_per_s"] / 1e3) for batch in shown),
