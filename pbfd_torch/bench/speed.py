@@ -189,30 +189,30 @@ def _left_out(one: Contestant, worlds: int, threads: int, effort: Effort) -> str
 
 
 def _entered(one: Contestant, work: Work, record: Record, worlds: int, threads: int, effort: Effort) -> Turns:
-    """A contestant with what it does in its turns: the whole work, or less where that would take too long. Ours then makes few
-    steps of all worlds; of MuJoCo's, which knows no batch, fewer worlds stand for all."""
+    """A contestant with what it does in its turns: the whole work, or, where that would take too long, as much as does not. Ours
+    then makes fewer steps of all worlds; of MuJoCo's, which knows no batch, fewer worlds stand for all."""
     whole = [work.of(k, 1) for k in range(min(one.course.alone, effort.alone))] if worlds == 1 else [work.of(0, worlds)]
-    began = time.perf_counter()
-    if isinstance(one, Ours):
-        groups = GROUPS if worlds == 1 else 1
-        steps = max(1, min(one.course.steps, effort.few // (groups * worlds)))
-        call = one.ready_under_way(record, worlds, groups, steps, threads)
-        first = Turns(call, groups * worlds * steps, time.perf_counter() - began)
-    else:
-        part = [work.of(0, min(worlds, PEERS))]
-        first = Turns(one.ready(part, threads), _world_steps(part), time.perf_counter() - began)
+    groups = GROUPS if worlds == 1 else 1
+
+    def of_all(steps: int, ours: Ours) -> Turns:
+        began = time.perf_counter()
+        call = ours.ready_under_way(record, worlds, groups, steps, threads)
+        return Turns(call, groups * worlds * steps, time.perf_counter() - began)
+
+    def of_some(works: Sequence[Work]) -> Turns:
+        began = time.perf_counter()
+        return Turns(one.ready(works, threads), sum(x.world_steps for x in works), time.perf_counter() - began)
+
+    few = max(1, min(one.course.steps, effort.few // (groups * worlds)))
+    first = of_all(few, one) if isinstance(one, Ours) else of_some([work.of(0, min(worlds, PEERS))])
     first.take(_clock(threads))
-    most = effort.patience_s / first.times[0] * first.world_steps
-    if most < _world_steps(whole):
-        if isinstance(one, Ours) or worlds <= PEERS:
-            return first
-        whole = [work.of(0, max(PEERS, int(most / len(work.controls))))]
-    began = time.perf_counter()
-    return Turns(one.ready(whole, threads), _world_steps(whole), time.perf_counter() - began)
-
-
-def _world_steps(works: Sequence[Work]) -> int:
-    return sum(x.world_steps for x in works)
+    most = int(effort.patience_s / first.times[0] * first.world_steps)
+    if most >= sum(x.world_steps for x in whole):
+        return of_some(whole)
+    if isinstance(one, Ours):
+        steps = min(one.course.steps, most // (groups * worlds))
+        return of_all(steps, one) if steps > 2 * few else first
+    return of_some([work.of(0, most // len(work.controls))]) if most > first.world_steps else first
 
 
 def _clock(threads: int) -> Callable[[], float]:
