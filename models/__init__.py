@@ -7,7 +7,7 @@ from pbfd_torch.models.boxes import box_slide, box_slope
 from pbfd_torch.models.chains import chain_fixed, chain_free, chain_ground, chain_heavy, chain_slope, chain_slope_drop
 from pbfd_torch.models.grounds import conveyor, mesh_terrain, ramp_grid, turntable
 from pbfd_torch.models.manipulation import gripper, robot_arm
-from pbfd_torch.models.robots import file_setup, hopper, robot_setup, walker
+from pbfd_torch.models.robots import file_setup, hopper, quadruped, robot_setup, walker
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.models.spinning import dzhanibekov
 from pbfd_torch.models.stacks import arch, heavy_on_light, stack, stack_10
@@ -34,6 +34,7 @@ SCENES: dict[str, Callable[..., Setup]] = {
     "robot-arm": robot_arm,
     "hopper": hopper,
     "walker": walker,
+    "quadruped": quadruped,
 }
 
 __all__ = ["SCENES", "Setup", "file_setup", "robot_setup"]

@@ -1,4 +1,4 @@
-"""Scenes made from robot files: our own hopper and walker, and any URDF or MJCF file."""
+"""Scenes made from robot files: our own hopper, walker and quadruped, and any URDF or MJCF file."""
 
 from __future__ import annotations
 
@@ -55,3 +55,8 @@ def hopper(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.de
 def walker(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
     """A planar two-legged walker, dropped onto its feet and left to itself."""
     return file_setup(_HERE / "walker.xml", worlds, dtype, device)
+
+
+def quadruped(worlds: int = 1, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Setup:
+    """A robot dog of 12 hinges, dropped onto its feet, whose position servos hold its stance."""
+    return file_setup(_HERE / "quadruped.xml", worlds, dtype, device, keyframe="stance")

@@ -87,7 +87,7 @@ def test_settings_and_bad_names() -> None:
     assert (model.geom_solref[:, 0] == 0.02).all()
     with pytest.raises(InputError, match="no MJCF of the scene 'stack': must be one of chain-fixed"):
         mujoco_scenes.mjcf("stack")
-    assert set(CASES) == set(mujoco_scenes.NAMES)
+    assert {*CASES, "quadruped"} == set(mujoco_scenes.NAMES)
 
 
 # Runs ---------------------------------------------------------------------------------------------------------------------

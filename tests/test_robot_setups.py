@@ -1,4 +1,5 @@
-"""Robots from files as scenes: our hopper and walker have Gymnasium's parameters; ground is added where it is needed."""
+"""Robots from files as scenes: our hopper and walker have Gymnasium's parameters, our quadruped stands; ground is added where it
+is needed."""
 
 from __future__ import annotations
 
@@ -17,8 +18,10 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.errors import InputError
 from pbfd_torch.loading import Robot, load_robot
 from pbfd_torch.models import SCENES, file_setup, robot_setup
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.tree.kinematics import place
 from tests.gymnasium_files import gymnasium_file
 from tests.scene_contacts import contact_of, depth, mu
 
@@ -171,3 +174,24 @@ def test_robot_setup_takes_keyframes(tmp_path: Path) -> None:
     assert (setup.q.tolist(), setup.v.tolist(), setup.controls(1).tolist()) == ([[0]], [[0]], [[[0]]])
     with pytest.raises(InputError, match="no keyframe named 'home': the keyframes are moving"):
         robot_setup(robot, keyframe="home")
+
+
+def test_quadruped_stands() -> None:
+    """Twelve servos with a largest force, each within its joint's range, hold 12.2 kg: dropped by 2 cm, after 1 s it stands on its
+    four feet, its hinges within .15 rad of where they are told to be, and hardly moves."""
+    setup = SCENES["quadruped"]()
+    model = compiled(ROOT / "models" / "quadruped.xml")
+    assert model.body_mass.sum() == pytest.approx(12.2)
+    np.testing.assert_allclose(model.actuator_ctrlrange, model.jnt_range[1:], rtol=1e-15)
+    assert (model.actuator_forcerange[:, 1] > 0).all()
+    simulator = Simulator(setup.scene, setup.dt)
+    controls = setup.controls(125)
+    rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v, controls[0]), controls)
+    assert bool(rollout.solved.all())
+    q, v = rollout.q[-1], rollout.v[-1]
+    assert 0.28 < float(q[0, 2]) < 0.32
+    assert float((q[0, 7:] - controls[0, 0]).abs().max()) < 0.15
+    assert float(v.abs().max()) < 0.1
+    deep = contact_of(setup).depth(place(setup.scene.articulation, q))[0] > 0
+    found = [part for (part, _), touches in zip(contact_of(setup).pairs, deep.tolist(), strict=True) if touches]
+    assert [name.removesuffix("_foot") for name in found] == ["front_left", "front_right", "rear_left", "rear_right"]

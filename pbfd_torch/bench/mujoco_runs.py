@@ -70,16 +70,23 @@ def run(model: Any, q: Tensor, v: Tensor, steps: int, control: Tensor | None = N
     def call() -> Any:
         return rollout.rollout(model, data, start[None], controls, nstep=steps)
 
-    with _silent():
+    with silent():
         (states, _), seconds = timed(lambda: call, repeats, enough_s=0.3)
-    diverged = any(data.warning[int(getattr(mujoco.mjtWarning, name))].number > 0 for name in _DIVERGED)
+    lost = diverged(data)
     path = torch.from_numpy(np.concatenate((start[None], states[0])))  # time, q, v
-    path = torch.full_like(path, torch.nan) if diverged or not bool(torch.isfinite(path).all()) else path
+    path = torch.full_like(path, torch.nan) if lost or not bool(torch.isfinite(path).all()) else path
     return Run(path[:, 1 : 1 + model.nq], path[:, 1 + model.nq : 1 + model.nq + model.nv], bool(path.isnan().any()), seconds)
 
 
+def diverged(data: Any) -> bool:
+    """Whether MuJoCo has found a bad state since its data was made."""
+    import mujoco
+
+    return any(data.warning[int(getattr(mujoco.mjtWarning, name))].number > 0 for name in _DIVERGED)
+
+
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def silent() -> Iterator[None]:
     """MuJoCo would log its warnings into the working directory."""
     import mujoco
 

@@ -14,7 +14,7 @@ import pbfd_torch.models
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import SCENES, boxes, chains
 
-ROBOTS = ("hopper", "walker")
+ROBOTS = ("hopper", "walker", "quadruped")
 # scene → (slope [rad], μ or None without contact, gravity [m/s²], is it free?)
 _CHAINS: dict[str, tuple[float, float | None, float, bool]] = {
     "chain-fixed": (0.0, None, chains.GRAVITY, False),

@@ -13,7 +13,7 @@ from pbfd_torch.bench.precision_reference import chain_tips, middle_axes
 from pbfd_torch.bench.precision_tracks import Track, rms
 from pbfd_torch.models import SCENES, Setup, boxes, chains
 
-FRAME = 0.1  # [s] for which a control is held; the longest step of the adaptive runs
+FRAME = 0.1  # [s] for which a control is held where a scene says nothing else; the longest step of the adaptive runs
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Case:
         observed_s: until when there is something to observe [s], where that is less than the duration.
         control: (time `[*]`) → `[*, nu]`, or None for zero.
         numbers: which of the track's numbers tell something here.
+        frame: [s] for which a control is held.
     """
 
     scene: str
@@ -47,6 +48,7 @@ class Case:
     observed_s: float = math.inf
     control: Callable[[Tensor], Tensor] | None = None
     numbers: tuple[str, ...] = ("energy_gain_J", "energy_gain")
+    frame: float = FRAME
 
     @property
     def tracked_worlds(self) -> int:
@@ -58,11 +60,11 @@ class Case:
         return SCENES[self.scene](worlds=worlds)
 
     def controls(self, dt: float, start: Tensor) -> Tensor | None:
-        """`[*, nu]` of the steps of length dt ≤ `FRAME` that begin at the times `[*]`. It is held for `FRAME`, as it is in the
+        """`[*, nu]` of the steps of length dt ≤ `frame` that begin at the times `[*]`. It is held for a frame, as it is in the
         middle of that, so that steps of all lengths see the same control."""
         if self.control is None:
             return None
-        return self.control(FRAME * (torch.floor((start + 0.5 * dt) / FRAME) + 0.5))
+        return self.control(self.frame * (torch.floor((start + 0.5 * dt) / self.frame) + 0.5))
 
     def error(self, track: Track, reference: Tensor) -> float:
         """In `unit`; NaN where the motion is not finite."""

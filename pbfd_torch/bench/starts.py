@@ -17,14 +17,18 @@ def _depth(setup: Setup, q: Tensor) -> Tensor:
     return torch.stack(depths).amax(0)
 
 
-def scattered(setup: Setup, seed: int = 0, bend: float = 0.3, speed: float = 1.0) -> tuple[Tensor, Tensor]:
+def scattered(
+    setup: Setup, seed: int = 0, bend: float = 0.3, speed: float = 1.0, moved: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Random starts `[worlds, nq]`, `[worlds, nv]` around the set-up's own, bent at every joint by `bend` [rad], moving at `speed`
-    [rad/s, m/s] (standard deviations), and lifted until nothing touches the ground deeper than it did."""
+    [rad/s, m/s] (standard deviations), and lifted until nothing touches the ground deeper than it did. moved: which degrees of
+    freedom `[nv]`, as 1 and 0; None: all."""
     random = torch.Generator().manual_seed(seed)
     a = setup.scene.articulation
 
     def normal() -> Tensor:
-        return torch.randn(setup.worlds, a.nv, dtype=torch.float64, generator=random).to(setup.q.dtype)
+        drawn = torch.randn(setup.worlds, a.nv, dtype=torch.float64, generator=random).to(setup.q.dtype)
+        return drawn if moved is None else drawn * moved
 
     q = retract(a, setup.q, bend * normal() * a.topology.turns.to(setup.q.dtype))
     v = setup.v + speed * normal()

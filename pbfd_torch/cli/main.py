@@ -15,6 +15,7 @@ from pbfd_torch.cli.bench_precision import precision
 from pbfd_torch.cli.bench_slope import slope
 from pbfd_torch.cli.bench_soak import soak
 from pbfd_torch.cli.bench_solvers import solvers
+from pbfd_torch.cli.bench_speed import speed
 from pbfd_torch.cli.evaluate import evaluate
 from pbfd_torch.cli.optimize import optimize
 from pbfd_torch.cli.options import (
@@ -45,6 +46,7 @@ bench = typer.Typer(no_args_is_help=True, help="Measures what the library does a
 bench.command()(solvers)
 bench.command()(friction)
 bench.command()(precision)
+bench.command()(speed)
 bench.command()(hard_cases)
 bench.command()(slope)
 bench.command()(soak)

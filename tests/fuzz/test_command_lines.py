@@ -22,6 +22,7 @@ from pbfd_torch.cli import (
     bench_slope,
     bench_soak,
     bench_solvers,
+    bench_speed,
     optimize,
     simulate,
 )
@@ -81,6 +82,7 @@ COMMANDS: dict[tuple[str, ...], tuple[list[str], dict[str, list[str]]]] = {
     ("bench", "precision"): ([], BENCH | {"--scenes": ["stack"], "--integrators": ["bdf2"]}),
     ("bench", "hard-cases"): ([], BENCH | {"--cases": ["free-fall"], "--integrators": ["bdf2"], "--dt": ["0.01"]}),
     ("bench", "slope"): ([], BENCH | {"--duration": ["1"]}),
+    ("bench", "speed"): ([], BENCH | {"--scenes": ["hopper", "stack"]}),
     ("bench", "soak"): ([], BENCH | {"--world-steps": ["10"], "--seed": ["3"], "--dt": ["0.01"]}),
 }
 
@@ -136,7 +138,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.chdir(folder)
         patch.setattr(simulate, "MAX_STEPS", 10)
         patch.setattr(optimize, "run", _not_measured)
-        for bench in (bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers):
+        for bench in (bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers, bench_speed):
             patch.setattr(bench, "measured", _not_measured)
         for trainer in (PpoTrainer, ShacTrainer):
             patch.setattr(trainer, "__init__", _not_measured)
