@@ -26,7 +26,7 @@ sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/nativ
 
 build/sanitized/%: tests/native/%.cpp tests/native/check.h $(NATIVE)
 	mkdir -p $(@D)
-	$(CXX) -std=c++17 -O1 -g -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
+	$(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
 		-Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<
 
 lint: .venv/.installed
