@@ -50,8 +50,7 @@ def started(simulator: Simulator[Any], q: Tensor, v: Tensor) -> Any:
     scheme = simulator.eager.integrator
     if isinstance(scheme, ImplicitEuler):
         return scheme.at_rate(simulator.articulation, q, v, nothing, simulator.eager.step_size)
-    rest = dict.fromkeys(("push", "steady", "lag"), nothing) | dict.fromkeys(("gained", "surplus", "peak"), zero)
-    return Velocities(**fresh(q), v=v, average=v, **rest)
+    return Velocities(**fresh(q), v=v, average=v, push=nothing, steady=nothing, lag=nothing, gained=zero, surplus=zero, peak=zero)
 
 
 def first_attempt(stepper: EagerStepper[Any], state: Any, control: Tensor) -> Solution:
@@ -82,8 +81,8 @@ def test_all_worlds_are_solved(name: str, dt: float, steps: int) -> None:
 
 
 def test_what_is_tried_is_what_the_reference_tries() -> None:
-    """Where both first attempts end at the same place and are of no use: by the same fallbacks to the same status in at least 95 %
-    of the steps, and to the same end in most."""
+    """Where both first attempts end at the same place, likewise unsolved or refused: by the same fallbacks to the same status in at
+    least 95 % of the steps, and to the same end in most."""
     judged = same_status = same_end = 0
     for name, dt, _ in ENERGY_MOMENTUM:
         simulator, native, state, controls = walked(name, dt)
@@ -95,7 +94,7 @@ def test_what_is_tried_is_what_the_reference_tries() -> None:
         part, before = simulator.eager.take(worlds), state.take(worlds)
         _, ours, _ = tight(native).made(before, held)
         theirs = first_attempt(part, before, held)
-        alike = ((ours.q - theirs.q).abs().amax(-1) < 1e-6) & ~ours.solved & ~theirs.solved
+        alike = ((ours.q - theirs.q).abs().amax(-1) < 1e-6) & ~ours.solved & (ours.status == theirs.status)
         end, found, _ = part.made(before, held)
         same = alike & (found.status == solution.status[index])
         judged, same_status = judged + int(alike.sum()), same_status + int(same.sum())
@@ -186,13 +185,13 @@ def require_equal(some: Any, whole: Any, solved: Solution, solution: Solution, i
 
 
 def test_a_step_may_be_given_little() -> None:
-    """No more is spent on it than that allows, and what is unsolved goes on from the best that was found."""
+    """No more is spent on it than that allows, and what is unsolved, or refused, goes on from the best that was found."""
     _, native, state, controls = walked("walker", 0.05)
     little = NativeStepper(native.eager.changed(evaluations=300))
     states, solution = little.run(state, controls[:20], 20)
     assert int(solution.evaluations.max()) <= 300
     assert bool(torch.isfinite(states.q).all())
-    assert not bool((solution.residual_norm[~solution.solved] <= TOLERANCE).any())
+    assert not bool(solution.solved.all())
     never = NativeStepper(native.eager.changed(halvings=0))
     _, solution = never.run(state, controls[:20], 20)
     assert int(solution.fallbacks[..., 3].sum()) == 0
