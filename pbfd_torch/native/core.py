@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 
 COUNTED = ("status", "evaluations", "iterations", "hazards")
+_COUNT = torch.empty(0, dtype=torch.int32)
 ALIGNMENT = 64
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
 BLOCKS = 4  # for each thread: some worlds take longer than others
@@ -84,43 +84,57 @@ class Terms:
 
 
 class Journey:
-    """Several steps of all worlds.
+    """Steps of all worlds: what they are to be made of, and room for what they come to, in two pieces of memory.
 
     Attributes:
         given: the fields of the state `[*batch, ...]` that each world sets out from.
         control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
-        fields: of the state after each step, `[steps, *batch, ...]`.
-        residual_norm, counted, fallbacks: how each was solved, `[steps, *batch, ...]`.
+        fields: of the state after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
+        residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
     """
 
-    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: int, grip: Tensor | None) -> None:
+    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: tuple[int, ...], grip: Tensor | None) -> None:
         batch = tuple(state.q.shape[:-1])
-        self.given = {name: _whole(getattr(state, name), (*batch, getattr(state, name).shape[-1])) for name in scheme.vectors}
+        self._steps, self._worlds = math.prod(steps), math.prod(batch)
+        self.given = {name: _whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in scheme.vectors}
         self.given |= {name: _whole(getattr(state, name), batch) for name in scheme.numbers}
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
         self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
-        self.fields = {name: x.new_empty((steps, *x.shape)) for name, x in self.given.items()}
-        self.residual_norm = state.q.new_empty((steps, *batch))
-        self.counted = {name: torch.empty((steps, *batch), dtype=torch.int32) for name in COUNTED}
-        self.fallbacks = torch.empty((steps, *batch, len(FALLBACKS)), dtype=torch.int32)
+        events = {name: x.shape[len(batch) :] for name, x in self.given.items()} | {"residual_norm": ()}
+        self.fields, self._found = self._room(state.q, (*steps, *batch), events)
+        self.residual_norm = self.fields.pop("residual_norm")
+        counts = dict.fromkeys(COUNTED, ()) | {"fallbacks": (len(FALLBACKS),)}
+        self.counted, self._counts = self._room(_COUNT, (*steps, *batch), counts)
+        self.fallbacks = self.counted.pop("fallbacks")
+
+    def _room(
+        self, like: Tensor, lead: tuple[int, ...], events: Mapping[str, Sequence[int]]
+    ) -> tuple[dict[str, Tensor], list[int]]:
+        """Arrays side by side in one piece of memory, and their addresses."""
+        each = math.prod(lead)
+        sizes = [each * math.prod(event) for event in events.values()]
+        memory = like.new_empty(sum(sizes))
+        parts = zip(memory.split(sizes), events.items(), strict=True)
+        arrays = {name: part.view(*lead, *event) for part, (name, event) in parts}
+        starts = itertools.accumulate(sizes[:-1], initial=0)
+        return arrays, [memory.data_ptr() + memory.element_size() * start for start in starts]
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
-        steps, *batch = self.residual_norm.shape
-        worlds = math.prod(batch)
-        asked = _Steps(*dataclasses.astuple(terms), worlds, 0, worlds, steps, len(self.control) == 1)
-        asked.control, asked.residual_norm = self.control.data_ptr(), self.residual_norm.data_ptr()
-        asked.fallbacks = self.fallbacks.data_ptr()
+        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, self._worlds, 0, self._worlds, self._steps)
+        asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
+        for i, x in enumerate(self.given.values()):
+            asked.given[i] = x.data_ptr()
+        *found, asked.residual_norm = self._found
+        *counted, asked.fallbacks = self._counts
+        asked.found[: len(found)], asked.counted[:] = found, counted
         if self.grip is not None:
             asked.grip = self.grip.data_ptr()
-        for array, values in ((asked.given, self.given), (asked.found, self.fields), (asked.counted, self.counted)):
-            for i, x in enumerate(values.values()):
-                array[i] = x.data_ptr()
         return asked
 
     @property
     def solution(self) -> Solution:
-        """How the steps were solved, `[steps, *batch, ...]`."""
+        """How the steps were solved, `[*steps, *batch, ...]`."""
         counted = {name: x for name, x in self.counted.items() if name != "hazards"}
         lanes = int(counted["evaluations"].sum())
         return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
@@ -144,12 +158,12 @@ class Core:
     def _asked(self, name: str) -> int:
         return int(getattr(self._functions, name)(ctypes.byref(self._plan)))
 
-    def go(self, state: State, control: Tensor, steps: int) -> Journey:
-        """So many steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On
-        several threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
+    def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
+        """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
+        threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
         journey = Journey(self._scheme, state, control, steps, self.plan.grip)
         asked = journey.call(self._terms)
-        blocks = min(BLOCKS * self._threads, asked.worlds * steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
+        blocks = min(BLOCKS * self._threads, asked.worlds * asked.steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
         if self._threads == 1 or blocks < 2:
             self._make(asked)
             return journey
@@ -180,7 +194,7 @@ class Core:
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(self._scheme, state, held, 1, self.plan.grip)
+        journey = Journey(self._scheme, state, held, (), self.plan.grip)
         at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         with self._room() as room:
@@ -190,7 +204,7 @@ class Core:
 
 def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:
     """All numbers of a tensor that may be one for several worlds, one after the other."""
-    return values.expand(shape).contiguous()
+    return values if values.shape == shape and values.is_contiguous() else values.expand(shape).contiguous()
 
 
 def _blocks(worlds: int, count: int, lanes: int) -> list[tuple[int, int]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, Generic
@@ -22,7 +21,6 @@ from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.stepping.way import Way
@@ -90,25 +88,24 @@ class NativeStepper(Generic[S]):
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
-        states, solution = self.run(state, None if control is None else control[None], 1)
-        after, solution = mapped(_first, states), dataclasses.replace(mapped(_first, solution), lanes=solution.lanes)
-        return after, solution, Way(solution.q)
+        after, solution = self._went(state, None if control is None else control[None], ())
+        return replaced(after, time=state.time + self.step_size), solution, Way(solution.q)
 
     def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
         after each, `[steps, *batch, ...]`, and how each was solved."""
-        batch = state.q.shape[:-1]
-        if not batch:
-            return mapped(lambda x: x.squeeze(1), self.run(mapped(lambda x: x[None], state), controls, steps))
+        after, solution = self._went(state, controls, (steps,))
+        time = torch.cat((state.time[None], self.step_size.expand(steps, *state.time.shape))).cumsum(0)[1:]
+        remembered = tuple(x.expand(steps, *x.shape) for x in state.memory)  # by terms that the core does not know
+        return replaced(after, time=time, memory=remembered), solution
+
+    def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> tuple[S, Solution]:
+        """The states after steps, but for their time, and how these were solved, each `[*steps, *batch, ...]`."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        controls = spread(controls, batch)
         with torch.no_grad():
-            journey = self._core.go(self._complete(state), controls, steps)
-            time = torch.cat((state.time[None], self.step_size.expand(steps, *batch))).cumsum(0)[1:]
-            fields = journey.fields | {"time": time, "hazards": journey.counted["hazards"]}
-            remembered = tuple(x.expand(steps, *x.shape) for x in state.memory)  # by terms that the core does not know
-            return replaced(state, **fields, memory=remembered), journey.solution
+            journey = self._core.go(self._complete(state), spread(controls, state.q.shape[:-1]), steps)
+            return replaced(state, **journey.fields, hazards=journey.counted["hazards"]), journey.solution
 
     def _complete(self, state: S) -> S:
         """With zero for an acceleration that is not known."""
@@ -150,8 +147,6 @@ def _planned(eager: EagerStepper[Any]) -> Plan:
 def spread(controls: Tensor, batch: Sequence[int]) -> Tensor:
     """Controls `[steps, *, nu]`, given for all worlds or for some dimensions of the batch, as `[steps, *batch, nu]`."""
     missing = len(batch) + 2 - controls.ndim
+    if missing == 0 and controls.shape[1:-1] == batch:
+        return controls
     return controls.reshape(len(controls), *(1,) * missing, *controls.shape[1:]).expand(len(controls), *batch, controls.shape[-1])
-
-
-def _first(values: Tensor) -> Tensor:
-    return values[0]

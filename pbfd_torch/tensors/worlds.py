@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import torch
@@ -68,13 +69,19 @@ class Census(Worlds):
         return [tuple(value.shape[: value.ndim - rank]) for value, rank in self.shown]
 
 
+@cache
+def _names(kind: type[DataclassInstance]) -> tuple[str, ...]:
+    """Of a dataclass's fields."""
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
 def replaced(instance: Instance, **changes: Any) -> Instance:
     """A copy of a frozen dataclass with some fields changed: `__post_init__` does not run, its checks being done, and cached
     properties are left behind, but for every `Fact` whose fields stay the same. The instance itself where no field changes
     identity."""
     if all(getattr(instance, name) is value for name, value in changes.items()):
         return instance
-    fields = {field.name: getattr(instance, field.name) for field in dataclasses.fields(instance)} | changes
+    fields = {name: getattr(instance, name) for name in _names(type(instance))} | changes
     copy = object.__new__(type(instance))
     vars(copy).update(fields | known(instance, fields))
     return copy
