@@ -163,7 +163,7 @@ class Simulator(Generic[S]):
         shapes, dtypes and devices.
 
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
-        theorem (`gradients.implicit`); its values are the same to the bit."""
+        theorem (`gradients.implicit`); it is then made in PyTorch, and its values are those of `Torch` to the bit."""
         control = self.scene.controlled(control, state.q.shape[:-1])
         if self._carriers().may_carry(state, control):
             linked = Linked(self.eager, self.gradients)
