@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pbfd_torch import InputError, Simulator
 from pbfd_torch.bench.starts import scattered
+from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import Velocities
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models import SCENES, file_setup
 from pbfd_torch.native.library import library
 from pbfd_torch.native.plan import planned
@@ -164,7 +164,7 @@ def test_a_plane_is_space_with_less(name: str, tmp_path: Path, monkeypatch: pyte
     [
         ("stack", {}, "BodyContact"),
         ("mesh-terrain", {}, "no half-space at rest"),
-        ("hopper", {"integrator": ImplicitEuler()}, "ImplicitEuler"),
+        ("hopper", {"integrator": Bdf2()}, "Bdf2"),
     ],
 )
 def test_what_is_not_covered_is_said(name: str, changes: dict[str, Any], words: str) -> None:

@@ -30,9 +30,9 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
 class NativeStepper(Generic[S]):
-    """A `Stepper` whose steps the compiled core makes, with all their fallbacks, of what an `EagerStepper` is made of. `threads`:
-    at most, for batches that are worth it; None: as many as PyTorch uses. Raises `InputError` where there is no core, and for a
-    scene that it does not know, naming what it lacks (`uncovered`)."""
+    """A `Stepper` whose steps the compiled core makes, fallbacks and all, of what an `EagerStepper` is made of. `threads`: at most,
+    for batches that are worth it; None: as many as PyTorch uses. Raises `InputError` where there is no core, and for a scene that
+    it does not know, naming what it lacks (`uncovered`)."""
 
     def __init__(self, eager: EagerStepper[S], threads: int | None = None) -> None:
         try:

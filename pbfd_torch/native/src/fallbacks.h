@@ -10,10 +10,13 @@ struct Stage {
   bool lagged;  // its friction feels the normal forces where it starts
 };
 
-constexpr Stage PLAIN = {1, 1, 1, false};
+constexpr Stage PLAIN = {1, 1, 1, false}, LAGGED = {1, 1, 1, true};
+constexpr Stage shorter(double length) { return {1, 1, length, false}; }
+constexpr Stage wider(double width) { return {width, 1, 1, false}; }
+constexpr Stage softer(double firmness) { return {1, firmness, 1, false}; }
 
-// Easier problems in turn, each solved to the tolerance from where the one before it ended, the first from θ_n; then the step's own,
-// with at most `last` evaluations.
+// Easier problems in turn, each solved to the tolerance from where the one before it ended, the first from θ_n; then the step's
+// own, with at most `last` evaluations.
 struct Detour {
   int kind;  // its place among the fallbacks that are counted, −1: none
   Status status;  // of a world that it helped
@@ -28,10 +31,10 @@ constexpr int SOON = 40, DIRECT = 200, CLIMB = 60, LAST = 100, LONG = 60;  // ev
 
 constexpr Detour DETOURS[WAYS] = {
     // along the motion, for roots that have strayed
-    {1, CONTINUED, false, CLIMB, 4, 1e-2, {{1, 1, 1.0 / 256, false}, {1, 1, 1.0 / 64, false}, {1, 1, 1.0 / 16, false}, {1, 1, 0.25, false}}},
-    {0, WARM_STARTED, false, LAST, 2, 1e-2, {{1, 1, 1, true}, {1, 1, 1, true}}},
-    {1, CONTINUED, false, LAST, 3, 1e-1, {{1000, 1, 1, false}, {100, 1, 1, false}, {10, 1, 1, false}}},
-    {1, CONTINUED, false, LAST, 3, 1e-2, {{1, 1e-3, 1, false}, {1, 1e-2, 1, false}, {1, 1e-1, 1, false}}},
+    {1, CONTINUED, false, CLIMB, 4, 1e-2, {shorter(1.0 / 256), shorter(1.0 / 64), shorter(1.0 / 16), shorter(0.25)}},
+    {0, WARM_STARTED, false, LAST, 2, 1e-2, {LAGGED, LAGGED}},
+    {1, CONTINUED, false, LAST, 3, 1e-1, {wider(1000), wider(100), wider(10)}},
+    {1, CONTINUED, false, LAST, 3, 1e-2, {softer(1e-3), softer(1e-2), softer(1e-1)}},
     // the direct way from the guess: the retreat from it may have been the mistake
     {-1, SOLVED, true, LAST, 0, 0, {}}};
 
@@ -62,9 +65,9 @@ template <class T> struct Fallbacks {
     return way == DIRECTLY ? found || (ended != SOLVED && ended != NON_FINITE) : found && !on_a_stage() && way != ALONG;
   }
 
-  // A solve has ended with this error, its root far from where the motion leads or not (asked for where `doubts` says so). `better`:
-  // whether that is the best end so far; `afford` says whether so many evaluations more may be spent, `count` is told of detours that
-  // are taken. Whether another solve is to follow.
+  // A solve has ended with this error; `strayed` is known where `doubts` says so. `better`: whether that is the best end so far;
+  // `afford` says whether so many evaluations more may be spent, and `count` is told of detours that are taken. Whether another
+  // solve is to follow.
   template <class Afford, class Count>
   bool go_on(int ended, T reached, bool strayed, double tight, bool& better, Afford&& afford, Count&& count) {
     better = false;

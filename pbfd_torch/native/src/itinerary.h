@@ -8,8 +8,8 @@ namespace pbfd {
 
 enum Fallback { WARM_START, CONTINUATION, EASIER_STEP, HALVING, FALLBACKS };  // as they are counted
 
-// What follows an attempt. The step has ended: here, at the best end so far, or with the last of its parts; or else it is tried again
-// as an easier one or from the first of shorter parts on, or the same part as an easier one; or the next part follows.
+// What follows an attempt. The step has ended: here, at the best end so far, or with the last of its parts. Or else it is tried
+// again as an easier one or from the first of shorter parts on, or the same part as an easier one; or the next part follows.
 enum Then { END, END_AT_BEST, END_OF_PARTS, EASE, HALVE, EASE_PART, NEXT_PART };
 
 template <class T, bool EASIER> struct Itinerary {
@@ -35,8 +35,8 @@ template <class T, bool EASIER> struct Itinerary {
 
   bool whole() const { return halvings == 0; }
   bool first() const { return tried == 0; }
-  // Whether it goes through all detours, and whether these count as the step's own. Where not, nothing is tried after them but
-  // shorter steps at most, and roots that have strayed are good enough.
+  // Whether it goes through all detours, and whether these count as the step's own. Where not, roots that have strayed are good
+  // enough.
   bool led() const { return eased || !EASIER; }
   bool own() const { return whole() && !eased; }
   bool affords(int cost) const { return evaluations + cost <= limit; }
@@ -45,7 +45,8 @@ template <class T, bool EASIER> struct Itinerary {
   Then after(const Rules& rules, int ended, T reached, int found) {
     const bool solved = ended <= HALVED;
     if (!whole()) return after_part(rules, ended, reached, found);
-    if (first() || solved || reached < infinite<T>()) status = eased && solved ? int(EASED) : ended, error = reached, hazards = found;
+    if (first() || solved || reached < infinite<T>())
+      status = eased && solved ? int(EASED) : ended, error = reached, hazards = found;
     if (solved || status == NON_FINITE) return END;
     return further(rules);
   }

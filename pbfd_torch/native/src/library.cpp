@@ -25,8 +25,9 @@ void make(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   Arena<V> arena{static_cast<V*>(room)};
   Scenery<V, N, D> scenery(sizes(p), p->whole, static_cast<const T*>(p->real), arena);
   Machine<V, N, D, Scheme<V, N, D>> machine(scenery, arena);
-  const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
-                           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
+  const Journey<T> journey{
+      s->worlds,  s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found, static_cast<T*>(s->residual_norm),
+      s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
   machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, p->halvings, s->evaluations}, s->first, s->last);
 }
 

@@ -1,4 +1,4 @@
-// The lane machine: every pass makes one evaluation for all lanes, each at its own place of its own step, with all that it tries, and
+// The lane machine: every pass makes one evaluation for all lanes, each at its own place of its own step and all that it tries, and
 // a lane that has ended its step takes the next one of its world, or another world, at once (the paper's Fig. 3).
 #pragma once
 #include "energy_momentum.h"

@@ -60,7 +60,8 @@ template <class V, class N, int D = 3> struct Newton {
     running = running | which, searching = searching & !which;
     at_guess = (at_guess & !which) | (which & safe), at_retreat = (at_retreat & !which) | (which & !safe);
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
-    error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status), high = select(which, infinite<V>(), high);
+    error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status);
+    high = select(which, infinite<V>(), high);
   }
 
   // One evaluation of every lane that runs, and what it does next.

@@ -1,5 +1,5 @@
-// What is asked of an integrator's steps, and what it keeps from one to the next: a state is a struct of pointers to arrays, with
-// `each(sizes, visit)`, which visits (member, width) in the order of the interface; the first one is q.
+// What is asked of an integrator's steps, and what it keeps from one to the next: a state is a struct of pointers to arrays, and
+// `State::each(sizes, visit)` visits (member, width) in the order of the interface, q first.
 #pragma once
 #include "plan.h"
 
