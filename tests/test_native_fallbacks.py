@@ -12,7 +12,9 @@ from torch import Tensor
 
 from pbfd_torch import Simulator
 from pbfd_torch.bench.starts import scattered
+from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import fresh
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
@@ -27,7 +29,8 @@ ENERGY_MOMENTUM = [("walker", 0.05, 20), ("chain-ground", 0.05, 20), ("chain-slo
 IMPLICIT_EULER = [("walker", 0.05, 20), ("chain-ground", 0.05, 20), ("hopper", 0.1, 25)]
 WORLDS = 33
 TOLERANCE, ROUNDED = 1e-9, 1.02  # a root that is just within it to one of both may be a rounding beyond it to the other
-JUDGED = 10  # steps with fallbacks that the reference makes too: it takes long for them
+LATER = 12  # steps, when starts that overlap have come apart
+JUDGED = 12  # steps with fallbacks that the reference makes too: it takes long for them
 
 
 @functools.cache
@@ -38,15 +41,24 @@ def walked(name: str, dt: float, integrator: Any = None) -> tuple[Simulator[Any]
     q, v = scattered(setup, 0, 0.3, 3.0)
     random = torch.Generator().manual_seed(1)
     controls = 2 * torch.rand(40, WORLDS, setup.scene.nu, dtype=torch.float64, generator=random) - 1
-    return simulator, NativeStepper(simulator.eager), simulator.initial_state(q, v), controls
+    return simulator, NativeStepper(simulator.eager), started(simulator, q, v), controls
 
 
-def first_attempt(stepper: EagerStepper[Any], state: Any, control: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the reference's first attempt ends, and which worlds `[n]` it solves and does not refuse."""
+def started(simulator: Simulator[Any], q: Tensor, v: Tensor) -> Any:
+    """Without the reference's trial step, which takes long from such starts."""
+    nothing, zero = torch.zeros_like(v), torch.zeros_like(q[..., 0])
+    scheme = simulator.eager.integrator
+    if isinstance(scheme, ImplicitEuler):
+        return scheme.at_rate(simulator.articulation, q, v, nothing, simulator.eager.step_size)
+    return Velocities(**fresh(q), v=v, average=v, push=nothing, steady=nothing, lag=nothing, gained=zero, surplus=zero, peak=zero)
+
+
+def first_attempt(stepper: EagerStepper[Any], state: Any, control: Tensor) -> Solution:
+    """The reference's, `STALLED` where its end is refused."""
     objective = stepper.objective(state, control)
     solution = stepper.first_solver.solve(objective, objective.guess, state.q)
     _, refusal = stepper.integrator.advance(objective, state, solution.q)
-    return solution.q, solution.solved if refusal is None else solution.solved & ~refusal()
+    return solution if refusal is None else solution.marked(solution.solved & refusal(), Status.STALLED)
 
 
 def tight(stepper: NativeStepper[Any]) -> NativeStepper[Any]:
@@ -55,35 +67,45 @@ def tight(stepper: NativeStepper[Any]) -> NativeStepper[Any]:
 
 
 @pytest.mark.parametrize(("name", "dt", "steps"), ENERGY_MOMENTUM)
-def test_what_is_tried_is_what_the_reference_tries(name: str, dt: float, steps: int) -> None:
-    """Where both make the same first attempt: by the same fallbacks to the same status and end, in nearly all cases. All worlds are
-    solved, within their budget, and roots of the step itself are roots to the reference."""
+def test_all_worlds_are_solved(name: str, dt: float, steps: int) -> None:
+    """Within their budget, and roots of the step itself are roots to the reference."""
     simulator, native, state, controls = walked(name, dt)
-    eager, hasty = simulator.eager, tight(native)
-    judged = same_status = same_end = 0
     for control in controls[:steps]:
         after, solution, _ = native.made(state, control)
         assert bool(solution.solved.all())
         assert int(solution.evaluations.max()) <= 5000
         plain = solution.status == int(Status.SOLVED)
-        objective = eager.objective(state, control)
+        objective = simulator.eager.objective(state, control)
         assert bool((objective.error(objective.evaluate(after.q), TOLERANCE)[plain] <= ROUNDED * TOLERANCE).all())
-        index = (~plain).nonzero().squeeze(-1)[: max(0, JUDGED - judged)]
-        if len(index):
-            worlds, held = Worlds((WORLDS,), index), control[index]
-            part, before = eager.take(worlds), state.take(worlds)
-            ours, _, _ = hasty.made(before, held)
-            theirs, accepted = first_attempt(part, before, held)
-            alike = ((ours.q - theirs).abs().amax(-1) < 1e-6) & ~accepted
-            end, found, _ = part.made(before, held)
-            judged += int(alike.sum())
-            same = alike & (found.status == solution.status[index])
-            same_status += int(same.sum())
-            same_end += int((same & ((end.q - after.q[index]).abs().amax(-1) < 1e-6)).sum())
         state = after
-    assert judged >= JUDGED // 2
+
+
+def test_what_is_tried_is_what_the_reference_tries() -> None:
+    """Where both first attempts end at the same place, likewise unsolved or refused: by the same fallbacks to the same status in at
+    least 95 % of the steps, and to the same end in most."""
+    judged = same_status = same_end = 0
+    for name, dt, _ in ENERGY_MOMENTUM:
+        simulator, native, state, controls = walked(name, dt)
+        states, _ = native.run(state, controls, LATER)
+        state, control = mapped(_last, states), controls[LATER]
+        after, solution, _ = native.made(state, control)
+        index = (solution.status != int(Status.SOLVED)).nonzero().squeeze(-1)[:JUDGED]
+        worlds, held = Worlds((WORLDS,), index), control[index]
+        part, before = simulator.eager.take(worlds), state.take(worlds)
+        _, ours, _ = tight(native).made(before, held)
+        theirs = first_attempt(part, before, held)
+        alike = ((ours.q - theirs.q).abs().amax(-1) < 1e-6) & ~ours.solved & (ours.status == theirs.status)
+        end, found, _ = part.made(before, held)
+        same = alike & (found.status == solution.status[index])
+        judged, same_status = judged + int(alike.sum()), same_status + int(same.sum())
+        same_end += int((same & ((end.q - after.q[index]).abs().amax(-1) < 1e-6)).sum())
+    assert judged >= 10
     assert same_status >= 0.95 * judged
     assert same_end >= 0.8 * judged
+
+
+def _last(values: Tensor) -> Tensor:
+    return values[-1]
 
 
 @pytest.mark.parametrize(("name", "dt", "steps"), IMPLICIT_EULER)
@@ -163,12 +185,13 @@ def require_equal(some: Any, whole: Any, solved: Solution, solution: Solution, i
 
 
 def test_a_step_may_be_given_little() -> None:
-    """No more is spent on it than that allows, and what is unsolved goes on from the best that was found."""
+    """No more is spent on it than that allows, and what is unsolved, or refused, goes on from the best that was found."""
     _, native, state, controls = walked("walker", 0.05)
     little = NativeStepper(native.eager.changed(evaluations=300))
     states, solution = little.run(state, controls[:20], 20)
     assert int(solution.evaluations.max()) <= 300
     assert bool(torch.isfinite(states.q).all())
+    assert not bool(solution.solved.all())
     within = ~solution.solved & (solution.residual_norm <= TOLERANCE)
     for step, world in within.nonzero().tolist():  # refused, and nothing was left for anything else
         one = Worlds((WORLDS,), torch.tensor([world]))
