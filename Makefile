@@ -24,7 +24,7 @@ fuzz: .venv/.installed
 sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/native/*.cpp))
 	set -e; for test in $^; do echo $$test; $$test; done
 
-build/sanitized/%: tests/native/%.cpp tests/native/check.h $(NATIVE)
+build/sanitized/%: tests/native/%.cpp $(wildcard tests/native/*.h) $(NATIVE)
 	mkdir -p $(@D)
 	$(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
 		-Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<

@@ -192,6 +192,14 @@ def test_a_step_may_be_given_little() -> None:
     assert int(solution.evaluations.max()) <= 300
     assert bool(torch.isfinite(states.q).all())
     assert not bool(solution.solved.all())
+    within = ~solution.solved & (solution.residual_norm <= TOLERANCE)
+    for step, world in within.nonzero().tolist():  # refused, and nothing was left for anything else
+        one = Worlds((WORLDS,), torch.tensor([world]))
+        before = (mapped(lambda x, k=step: x[k - 1], states) if step else state).take(one)
+        objective = native.eager.take(one).objective(before, controls[step, world : world + 1])
+        _, refusal = native.integrator.advance(objective, before, states.q[step, world : world + 1])
+        assert refusal is not None
+        assert bool(refusal().all())
     never = NativeStepper(native.eager.changed(halvings=0))
     _, solution = never.run(state, controls[:20], 20)
     assert int(solution.fallbacks[..., 3].sum()) == 0
