@@ -115,7 +115,7 @@ class Journey:
         sizes = [each * math.prod(event) for event in events.values()]
         memory = like.new_empty(sum(sizes))
         parts = zip(memory.split(sizes), events.items(), strict=True)
-        arrays = {name: part.view(*lead, *event) for part, (name, event) in parts}
+        arrays = {name: part.view((*lead, *event)) for part, (name, event) in parts}
         starts = itertools.accumulate(sizes[:-1], initial=0)
         return arrays, [memory.data_ptr() + memory.element_size() * start for start in starts]
 
