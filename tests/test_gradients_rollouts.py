@@ -15,6 +15,7 @@ from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.models import SCENES
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import replaced
@@ -131,7 +132,7 @@ def test_values_are_the_same_to_the_bit(name: str) -> None:
     expected = plain.trajectory(plain.initial_state(setup.q, v), steps=9)
     names = ("articulation.pseudo_inertia", "terms.1.friction.mu")
     values = {n: x.clone().requires_grad_() for n, x in parameters(setup.scene).items() if n in names}
-    simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name]())
+    simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name](), engine=Torch())
     gradients = []
     for checkpoint in (1, 4):
         given = v.clone().requires_grad_()
