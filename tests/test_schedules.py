@@ -8,9 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from pbfd_torch import Simulator
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models import SCENES
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.schedules.workers import Workers
@@ -120,7 +123,7 @@ def test_asynchronous_saves_what_max_over_mean_predicts() -> None:
 def test_compaction_changes_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lock step with and without compaction: bitwise the same, at fewer evaluations spent."""
     setup = SCENES["chain-ground"](worlds=24)
-    simulator = implicit(setup.scene, 0.02)
+    simulator = Simulator(setup.scene, 0.02, ImplicitEuler(), engine=Torch())
     state = simulator.initial_state(*scattered(setup))
     for _ in range(12):
         state, _ = simulator.step(state)
@@ -134,7 +137,7 @@ def test_compaction_changes_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_interrupted_asynchronous_rollout_keeps_the_steps_of_all_worlds() -> None:
     """Ctrl-C in the middle: the steps that every world has made are kept, bitwise those of the whole rollout."""
     setup = SCENES["chain-fixed"](worlds=3)
-    simulator = implicit(setup.scene, 0.05)
+    simulator = Simulator(setup.scene, 0.05, ImplicitEuler(), engine=Torch())
     state = simulator.initial_state(*scattered(setup))
     done = 0
 
