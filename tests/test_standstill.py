@@ -16,6 +16,7 @@ from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES
 from pbfd_torch.models.chains import chain_ground
 from pbfd_torch.schedules.asynchronous import AsynchronousRollout
+from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import Worlds
@@ -171,7 +172,7 @@ def test_asynchronous_standstill() -> None:
     """The asynchronous schedule says and keeps the same as lock step, to the bit."""
     simulator, start = started("chain-ground", 8)
     sick = poisoned(start, "v 1e8")
-    together = simulator.rollout(sick, steps=3)
+    together = rolled_out(simulator.eager, sick, steps=3)
     apart = AsynchronousRollout(simulator, sick, 3).finish()
     assert torch.equal(together.status, apart.status)
     assert together.status[:, SICK].tolist() == [Status.NON_FINITE] * 3
