@@ -47,7 +47,8 @@ WORLDS, DT, SEED = ["1", "2", "3"], ["0.02", "0.05"], ["0", "7"]
 SIMULATE: dict[str, list[str]] = {
     "--worlds": WORLDS, "--duration": ["0.1"], "--dt": DT, "--accuracy": ["0.01"], "--seed": SEED, "--out": OUT,
     "--integrator": ["bdf2", "implicit-euler"], "--solver": ["lm", "jtj-lm"], "--friction": ["none", "anchored"],
-    "--dtype": ["float32"], "--device": ["cpu", "cuda"], "--schedule": ["asynchronous"], "--engine": ["native", "torch"], "--workers": ["1"], "--threads": ["1"],
+    "--dtype": ["float32"], "--device": ["cpu", "cuda"], "--schedule": ["asynchronous"], "--engine": ["native", "torch"],
+    "--workers": ["1"], "--threads": ["1"],
     "--keyframe": ["home"], "--free-base": [""], "--fixed-base": [""], "--json": [""],
 }  # fmt: skip
 VIEW: dict[str, list[str]] = {
