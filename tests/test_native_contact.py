@@ -89,7 +89,7 @@ def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tupl
     depth = 0.003 * normal(worlds)
     every = torch.arange(worlds)
     for _ in range(4):  # along the normals until the depths fit
-        still = resting(a, q, torch.zeros_like(q[..., 1:]))
+        still = resting(q, torch.zeros_like(q[..., 1:]))
         step = Simulator(scene, DT).eager.objective(still).step
         for k, contact in enumerate(contacts):
             mine = every % len(contacts) == k
@@ -99,7 +99,7 @@ def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tupl
             q[:, :3] += torch.where(mine[:, None], shift, 0.0)
     q[:, :3] += 1e-4 * normal(worlds, 3)  # off the borders between faces
     v = speed * normal(worlds, a.nv)
-    return resting(a, retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v), q
+    return resting(retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v), q
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_borders(shape: Shape, solid: Obstacle, places: Sequence[tuple[float, fl
     q[:, :3] = at
     before = q.clone()
     before[:, 0] += 1e-4
-    state = resting(scene.articulation, before, torch.zeros_like(q[:, 1:]))
+    state = resting(before, torch.zeros_like(q[:, 1:]))
     require_touching(scene, state, q)
     assert float(gaps(scene, state, q)[0].max()) < 1e-6
 
@@ -247,6 +247,6 @@ def test_tips_and_rims() -> None:
         tilted[:, 3] = turns
         q = retract(a, a.rest.expand(len(turns), -1), tilted)
         q[:, 2] += contact.depth(place(a, q)).amax(-1) - 1e-3
-        state = resting(a, retract(a, q, torch.full_like(tilted, 1e-4)), torch.zeros_like(tilted))
+        state = resting(retract(a, q, torch.full_like(tilted, 1e-4)), torch.zeros_like(tilted))
         require_touching(scene, state, q)
         require_balance(scene, state, q)

@@ -12,9 +12,7 @@ from torch import Tensor
 
 from pbfd_torch import Simulator
 from pbfd_torch.bench.starts import scattered
-from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.integrators.integrator import fresh
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
@@ -22,6 +20,7 @@ from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import Worlds
+from tests.native_parity import resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -46,11 +45,10 @@ def walked(name: str, dt: float, integrator: Any = None) -> tuple[Simulator[Any]
 
 def started(simulator: Simulator[Any], q: Tensor, v: Tensor) -> Any:
     """Without the reference's trial step, which takes long from such starts."""
-    nothing, zero = torch.zeros_like(v), torch.zeros_like(q[..., 0])
     scheme = simulator.eager.integrator
     if isinstance(scheme, ImplicitEuler):
-        return scheme.at_rate(simulator.articulation, q, v, nothing, simulator.eager.step_size)
-    return Velocities(**fresh(q), v=v, average=v, push=nothing, steady=nothing, lag=nothing, gained=zero, surplus=zero, peak=zero)
+        return scheme.at_rate(simulator.articulation, q, v, torch.zeros_like(v), simulator.eager.step_size)
+    return resting(q, v)
 
 
 def first_attempt(stepper: EagerStepper[Any], state: Any, control: Tensor) -> Solution:

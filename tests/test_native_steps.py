@@ -21,6 +21,7 @@ from pbfd_torch.native.stepper import NativeStepper, uncovered
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.tree.rotations import skew
+from tests.native_parity import compared
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -52,20 +53,13 @@ def test_parity(name: str, dt: float) -> None:
     native = NativeStepper(simulator.eager)
     direct, same = 0, 0
     for control in controls(simulator, steps, worlds):
-        after, solution, _ = native.made(state, control)
-        objective = simulator.eager.objective(state, control)
-        assert bool(solution.solved.all())
-        plain = solution.status == int(Status.SOLVED)
-        error = objective.error(objective.evaluate(after.q), 1e-9)
-        assert bool((error[plain] <= 1e-9).all())
-        state_after, eager, _ = simulator.eager.made(state, control)
-        both = plain & (eager.status == int(Status.SOLVED))
-        alike = both & ((after.q - state_after.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
+        step = compared(native, state, control)
+        assert bool(step.solution.solved.all())
+        direct, same = direct + int(step.both.sum()), same + int(step.alike.sum())
         for field in FIELDS:
-            a, b = getattr(after, field)[alike], getattr(state_after, field)[alike]
+            a, b = getattr(step.after, field)[step.alike], getattr(step.reference, field)[step.alike]
             assert torch.allclose(a.double(), b.double(), rtol=1e-5, atol=1e-6), field
-        state = state_after
+        state = step.reference
     assert same >= 0.97 * direct > 0
 
 

@@ -47,8 +47,8 @@ def test_limits_that_drives_press_on() -> None:
     moved[:, -2:] = torch.where(torch.arange(worlds) % 2 > 0, 1.0, -1.0)[:, None] * torch.tensor([0.3, 0.15]) + 2e-3 * v[:, -2:]
     control = 100 * torch.rand(worlds, 3, dtype=torch.float64, generator=random) ** 4
     q = retract(a, a.rest.expand(worlds, -1), moved)
-    require_balance(scene, resting(a, retract(a, q, -DT * v), v), q, control)
-    require_steps(scene, resting(a, q[:12], 0.1 * v[:12]), control[:12])
+    require_balance(scene, resting(retract(a, q, -DT * v), v), q, control)
+    require_steps(scene, resting(q[:12], 0.1 * v[:12]), control[:12])
 
 
 def test_pushes() -> None:
@@ -60,5 +60,5 @@ def test_pushes() -> None:
     scene = Scene(a, (Inertia(), Pushes(5 * force, 0.1 * point), Pushes.at_centers(a, force)), torch.zeros(3, dtype=torch.float64))
     v, moved = 0.3 * torch.randn(2, 20, a.nv, dtype=torch.float64, generator=random)
     q = retract(a, a.rest.expand(20, -1), moved)
-    require_balance(scene, resting(a, retract(a, q, -DT * v), v), q)
-    require_steps(scene, resting(a, q, v))
+    require_balance(scene, resting(retract(a, q, -DT * v), v), q)
+    require_steps(scene, resting(q, v))
