@@ -44,9 +44,9 @@ def require_shape(name: str, value: Tensor, event: tuple[int, ...]) -> None:
 
 def broadcast_batches(batches: dict[str, Sequence[int]]) -> tuple[int, ...]:
     """The batch shape that these go together to; raises `InputError` with all of them by name where they do not."""
-    first, *others = (tuple(shape) for shape in batches.values() if len(shape)) if any(map(len, batches.values())) else ((),)
-    if all(shape == first for shape in others):  # as they nearly always are
-        return first
+    shapes = {tuple(shape) for shape in batches.values() if len(shape)}
+    if len(shapes) < 2:  # as it nearly always is
+        return shapes.pop() if shapes else ()
     try:
         return tuple(torch.broadcast_shapes(*batches.values()))
     except RuntimeError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, Self, cast
+from typing import Any, Generic, Self
 
 from torch import Tensor
 
@@ -17,7 +17,6 @@ from pbfd_torch.gradients.linearization import Linearization, linearized
 from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.gradients.parts import Carriers
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
-from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.native.engine import Engine, Torch, chosen
 from pbfd_torch.native.rollout import rolled_out as many_rolled_out
@@ -127,16 +126,15 @@ class Simulator(Generic[S]):
 
     def sized(self, step_size: Tensor) -> Self:
         """The same simulator with steps [s] of another length `[]`, or of one for each world `[*batch]`."""
-        other = copy.copy(self)
-        other.eager, other._made = self.eager.sized(step_size), None
-        other._carrying = None
-        return other
+        return self._by(self.eager.sized(step_size))
 
     def with_scene(self, scene: Scene) -> Self:
         """The same simulator of the same scene with other numbers: as a new one would be, but no device is asked for anything."""
+        return self._by(self.eager.with_scene(scene))
+
+    def _by(self, eager: EagerStepper[S]) -> Self:
         other = copy.copy(self)
-        other.eager, other._made = self.eager.with_scene(scene), None
-        other._carrying = None
+        other.eager, other._made, other._carrying = eager, None, None
         return other
 
     def initial_state(self, q: Array | None = None, v: Array | None = None, control: Array | None = None) -> S:
@@ -207,7 +205,7 @@ class Simulator(Generic[S]):
         Raises `ContactOverflowError`, which holds the steps done, where the scene asks for it."""
         stepper: Stepper[Any] = self.stepper
         if isinstance(stepper, NativeStepper):
-            return many_rolled_out(stepper, cast(Velocities, state), controls, steps, progress)
+            return many_rolled_out(stepper, state, controls, steps, progress)
         return rolled_out(stepper, state, controls, steps, progress)
 
 

@@ -41,6 +41,11 @@ def version() -> str | None:
         return None
 
 
+def absent(so: str) -> tuple[str, ...]:
+    """A note that there is no MuJoCo, what follows and what brings it; none where it can be imported."""
+    return () if version() else (f"MuJoCo cannot be imported: {so}; pip install 'pbfd_torch[bench]' brings it",)
+
+
 def loaded(name: str, dt: float, integrator: str, world: int = 0) -> Any:
     """The `MjModel` of a scene with step `dt` [s] and one of the `INTEGRATORS`. Contacts are as stiff as MuJoCo takes them, with a
     time constant of 2Δt and critical damping; those of the robots are as their files have them."""

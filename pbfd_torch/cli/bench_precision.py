@@ -65,7 +65,6 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) 
     started = time.perf_counter()
     version = mujoco_runs.version()
     peers = mujoco_runs.INTEGRATORS if version else ()
-    missing = () if version else ("MuJoCo cannot be imported: ours alone; pip install 'pbfd_torch[bench]' brings it",)
     total = sum(effort.units(CASES[name], integrators, peers) for name in scenes)
     found = {}
     with tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
@@ -79,7 +78,7 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) 
         "integrators": list(integrators),
         "scenes": found,
         "losses": losses(found),
-        "notes": [*NOTES, *missing],
+        "notes": [*NOTES, *mujoco_runs.absent("ours alone")],
     }
 
 

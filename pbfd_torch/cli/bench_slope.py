@@ -60,7 +60,6 @@ def measured(effort: Effort) -> dict[str, Any]:
     started = time.perf_counter()
     version = mujoco_runs.version()
     shortened = (f"at most {effort.most_steps} steps a run; in (b) Newton–Euler takes up to 4 times as many, MuJoCo all",)
-    missing = () if version else ("MuJoCo cannot be imported: not compared; pip install 'pbfd_torch[bench]' brings it",)
     with tqdm(total=units(effort), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
         found = measure(effort, bar.update)
     report = {"duration_s": effort.duration, "worlds": effort.worlds, **found}
@@ -69,7 +68,7 @@ def measured(effort: Effort) -> dict[str, Any]:
         "environment": environment() | {"mujoco": version},
         "claims": claims(report),
         **report,
-        "notes": [*NOTES, *shortened, *missing],
+        "notes": [*NOTES, *shortened, *mujoco_runs.absent("not compared")],
     }
 
 

@@ -61,7 +61,6 @@ def measured(scenes: Sequence[str], effort: Effort) -> dict[str, Any]:
 
     started = time.perf_counter()
     version, core, threads = mujoco_runs.version(), library(), all_threads()
-    missing = () if version else ("MuJoCo cannot be imported: ours alone; pip install 'pbfd_torch[bench]' brings it",)
     found, rows = {}, []
     total = sum(effort.units(COURSES[name], threads, version is not None) for name in scenes)
     with tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
@@ -76,7 +75,7 @@ def measured(scenes: Sequence[str], effort: Effort) -> dict[str, Any]:
         "scenes": found,
         "rows": rows,
         "ratios": ratios(rows),
-        "notes": [*NOTES, *missing],
+        "notes": [*NOTES, *mujoco_runs.absent("ours alone")],
     }
 
 

@@ -101,23 +101,11 @@ class Journey:
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
         self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
         events = {name: x.shape[len(batch) :] for name, x in self.given.items()} | {"residual_norm": ()}
-        self.fields, self._found = self._room(state.q, (*steps, *batch), events)
+        self.fields, self._found = _side_by_side(state.q, (*steps, *batch), events)
         self.residual_norm = self.fields.pop("residual_norm")
         counts = dict.fromkeys(COUNTED, ()) | {"fallbacks": (len(FALLBACKS),)}
-        self.counted, self._counts = self._room(_COUNT, (*steps, *batch), counts)
+        self.counted, self._counts = _side_by_side(_COUNT, (*steps, *batch), counts)
         self.fallbacks = self.counted.pop("fallbacks")
-
-    def _room(
-        self, like: Tensor, lead: tuple[int, ...], events: Mapping[str, Sequence[int]]
-    ) -> tuple[dict[str, Tensor], list[int]]:
-        """Arrays side by side in one piece of memory, and their addresses."""
-        each = math.prod(lead)
-        sizes = [each * math.prod(event) for event in events.values()]
-        memory = like.new_empty(sum(sizes))
-        parts = zip(memory.split(sizes), events.items(), strict=True)
-        arrays = {name: part.view((*lead, *event)) for part, (name, event) in parts}
-        starts = itertools.accumulate(sizes[:-1], initial=0)
-        return arrays, [memory.data_ptr() + memory.element_size() * start for start in starts]
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
@@ -205,6 +193,17 @@ class Core:
 def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:
     """All numbers of a tensor that may be one for several worlds, one after the other."""
     return values if values.shape == shape and values.is_contiguous() else values.expand(shape).contiguous()
+
+
+def _side_by_side(like: Tensor, lead: tuple[int, ...], events: Mapping[str, Sequence[int]]) -> tuple[dict[str, Tensor], list[int]]:
+    """Arrays side by side in one piece of memory, and their addresses."""
+    each = math.prod(lead)
+    sizes = [each * math.prod(event) for event in events.values()]
+    memory = like.new_empty(sum(sizes))
+    parts = zip(memory.split(sizes), events.items(), strict=True)
+    arrays = {name: part.view((*lead, *event)) for part, (name, event) in parts}
+    starts = itertools.accumulate(sizes[:-1], initial=0)
+    return arrays, [memory.data_ptr() + memory.element_size() * start for start in starts]
 
 
 def _blocks(worlds: int, count: int, lanes: int) -> list[tuple[int, int]]:

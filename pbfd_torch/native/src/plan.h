@@ -1,8 +1,7 @@
 // A scene as the core sees it: a tree of nodes (joints), what acts on its degrees of freedom, and contact candidates. What moves in
 // a plane only (hinges and slides, D = 2) is spared the third dimension: the same mechanics with fewer numbers.
 //
-// The numbers are those of all worlds (N a scalar) or every world's own (N like V). `Plan` walks once over two arrays that
-// native/plan.py has written in this order: this file and that one change together.
+// `Plan` walks once over two arrays that native/plan.py has written in this order: this file and that one change together.
 #pragma once
 #include "candidates.h"
 
