@@ -5,9 +5,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
@@ -22,7 +20,6 @@ from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 
 COUNTED = ("status", "evaluations", "iterations", "hazards")
-_COUNT = torch.empty(0, dtype=torch.int32)
 ALIGNMENT = 64
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
 BLOCKS = 4  # for each thread: some worlds take longer than others
@@ -84,7 +81,7 @@ class Terms:
 
 
 class Journey:
-    """Steps of all worlds: what they are to be made of, and room for what they come to, in two pieces of memory.
+    """Steps of all worlds: what they are to be made of, and room for what they come to.
 
     Attributes:
         given: the fields of the state `[*batch, ...]` that each world sets out from.
@@ -100,22 +97,21 @@ class Journey:
         self.given |= {name: _whole(getattr(state, name), batch) for name in scheme.numbers}
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
         self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
-        events = {name: x.shape[len(batch) :] for name, x in self.given.items()} | {"residual_norm": ()}
-        self.fields, self._found = _side_by_side(state.q, (*steps, *batch), events)
-        self.residual_norm = self.fields.pop("residual_norm")
-        counts = dict.fromkeys(COUNTED, ()) | {"fallbacks": (len(FALLBACKS),)}
-        self.counted, self._counts = _side_by_side(_COUNT, (*steps, *batch), counts)
-        self.fallbacks = self.counted.pop("fallbacks")
+        self.fields = {name: _room_for(x, steps) for name, x in self.given.items()}
+        self.residual_norm = state.q.new_empty((*steps, *batch))
+        first, *others = COUNTED
+        self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
+        self.counted |= {name: torch.empty_like(self.counted[first]) for name in others}
+        self.fallbacks = torch.empty((*steps, *batch, len(FALLBACKS)), dtype=torch.int32)
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
         asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, self._worlds, 0, self._worlds, self._steps)
         asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
-        for i, x in enumerate(self.given.values()):
-            asked.given[i] = x.data_ptr()
-        *found, asked.residual_norm = self._found
-        *counted, asked.fallbacks = self._counts
-        asked.found[: len(found)], asked.counted[:] = found, counted
+        asked.given[: len(self.given)] = [x.data_ptr() for x in self.given.values()]
+        asked.found[: len(self.fields)] = [x.data_ptr() for x in self.fields.values()]
+        asked.counted[:] = [x.data_ptr() for x in self.counted.values()]
+        asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
         if self.grip is not None:
             asked.grip = self.grip.data_ptr()
         return asked
@@ -126,6 +122,14 @@ class Journey:
         counted = {name: x for name, x in self.counted.items() if name != "hazards"}
         lanes = int(counted["evaluations"].sum())
         return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
+
+
+class _Room:
+    """Memory to work in, which begins where a register may lie."""
+
+    def __init__(self, size: int) -> None:
+        self._memory = torch.empty(size + ALIGNMENT, dtype=torch.uint8)
+        self.begin = ctypes.c_void_p(-(-self._memory.data_ptr() // ALIGNMENT) * ALIGNMENT)
 
 
 class Core:
@@ -139,8 +143,9 @@ class Core:
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), len(plan.real)):
             raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")
-        self._size = self._asked("pbfd_room") + ALIGNMENT
-        self._rooms: list[Tensor] = []  # that no call is in
+        self._size = self._asked("pbfd_room")
+        self._function, self._pointer = getattr(library.functions, scheme.function), ctypes.byref(self._plan)
+        self._rooms: list[_Room] = []  # that no call is in
         self._lanes = library.lanes(plan.real.dtype)
 
     def _asked(self, name: str) -> int:
@@ -164,18 +169,16 @@ class Core:
         return journey
 
     def _make(self, asked: _Steps) -> None:
-        with self._room() as room:
-            getattr(self._functions, self._scheme.function)(ctypes.byref(self._plan), ctypes.byref(asked), room)
-
-    @contextmanager
-    def _room(self) -> Iterator[ctypes.c_void_p]:
-        """Memory to work in, which begins where a register may lie; one call at a time is in it."""
-        try:
-            room = self._rooms.pop()
-        except IndexError:
-            room = torch.empty(self._size, dtype=torch.uint8)
-        yield ctypes.c_void_p(-(-room.data_ptr() // ALIGNMENT) * ALIGNMENT)
+        room = self._room()
+        self._function(self._pointer, ctypes.byref(asked), room.begin)
         self._rooms.append(room)
+
+    def _room(self) -> _Room:
+        """Memory for one call at a time."""
+        try:
+            return self._rooms.pop()
+        except IndexError:
+            return _Room(self._size)
 
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
         """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and
@@ -185,8 +188,9 @@ class Core:
         journey = Journey(self._scheme, state, held, (), self.plan.grip)
         at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
-        with self._room() as room:
-            self._functions.pbfd_balance(ctypes.byref(self._plan), ctypes.byref(journey.call(self._terms)), *addresses, room)
+        room = self._room()
+        self._functions.pbfd_balance(self._pointer, ctypes.byref(journey.call(self._terms)), *addresses, room.begin)
+        self._rooms.append(room)
         return residual, jacobian
 
 
@@ -195,15 +199,9 @@ def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:
     return values if values.shape == shape and values.is_contiguous() else values.expand(shape).contiguous()
 
 
-def _side_by_side(like: Tensor, lead: tuple[int, ...], events: Mapping[str, Sequence[int]]) -> tuple[dict[str, Tensor], list[int]]:
-    """Arrays side by side in one piece of memory, and their addresses."""
-    each = math.prod(lead)
-    sizes = [each * math.prod(event) for event in events.values()]
-    memory = like.new_empty(sum(sizes))
-    parts = zip(memory.split(sizes), events.items(), strict=True)
-    arrays = {name: part.view((*lead, *event)) for part, (name, event) in parts}
-    starts = itertools.accumulate(sizes[:-1], initial=0)
-    return arrays, [memory.data_ptr() + memory.element_size() * start for start in starts]
+def _room_for(given: Tensor, steps: tuple[int, ...]) -> Tensor:
+    """What a field `[*batch, ...]` becomes, `[*steps, *batch, ...]`."""
+    return given.new_empty((*steps, *given.shape)) if steps else torch.empty_like(given)  # the quicker one
 
 
 def _blocks(worlds: int, count: int, lanes: int) -> list[tuple[int, int]]:

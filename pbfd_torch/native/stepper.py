@@ -14,7 +14,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import Integrator, S
-from pbfd_torch.native.core import SCHEMES, Core, Terms
+from pbfd_torch.native.core import SCHEMES, Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError
 from pbfd_torch.native.plan import Plan, planned
@@ -88,24 +88,25 @@ class NativeStepper(Generic[S]):
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
-        after, solution = self._went(state, None if control is None else control[None], ())
-        return replaced(after, time=state.time + self.step_size), solution, Way(solution.q)
+        journey = self._went(state, None if control is None else control[None], ())
+        solution = journey.solution
+        time, hazards = state.time + self.step_size, journey.counted["hazards"]
+        return replaced(state, **journey.fields, time=time, hazards=hazards), solution, Way(solution.q)
 
     def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
         after each, `[steps, *batch, ...]`, and how each was solved."""
-        after, solution = self._went(state, controls, (steps,))
+        journey = self._went(state, controls, (steps,))
         time = torch.cat((state.time[None], self.step_size.expand(steps, *state.time.shape))).cumsum(0)[1:]
         remembered = tuple(x.expand(steps, *x.shape) for x in state.memory)  # by terms that the core does not know
-        return replaced(after, time=time, memory=remembered), solution
+        hazards = journey.counted["hazards"]
+        return replaced(state, **journey.fields, time=time, hazards=hazards, memory=remembered), journey.solution
 
-    def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> tuple[S, Solution]:
-        """The states after steps, but for their time, and how these were solved, each `[*steps, *batch, ...]`."""
+    def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
+        """The states after steps, and how these were solved."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        with torch.no_grad():
-            journey = self._core.go(self._complete(state), spread(controls, state.q.shape[:-1]), steps)
-            return replaced(state, **journey.fields, hazards=journey.counted["hazards"]), journey.solution
+        return self._core.go(self._complete(state), spread(controls, state.q.shape[:-1]), steps)
 
     def _complete(self, state: S) -> S:
         """With zero for an acceleration that is not known."""
