@@ -189,10 +189,17 @@ def test_curved_bodies_on_half_spaces(shape: Shape) -> None:
     require_steps(scene, beside(scene, 12, 5)[0])
 
 
-@pytest.mark.parametrize("solid", SOLIDS)
-def test_curved_bodies_on_solids(solid: str) -> None:
+@pytest.mark.parametrize("solid", sorted(SOLIDS.keys() - CONVEX.keys()))
+def test_curved_bodies_on_uneven_solids(solid: str) -> None:
     scene = touching(CURVED, (SOLIDS[solid],), CurvedContact)
     require_alike(scene, 240)
+
+
+@pytest.mark.parametrize("solid", CONVEX)
+def test_curved_bodies_on_convex_solids_are_not_compiled(solid: str) -> None:
+    """`contact_terms` makes no such terms."""
+    scene = touching(CURVED, (CONVEX[solid],), CurvedContact)
+    assert f"curved bodies on '{CONVEX[solid].name}'" in Simulator(scene, DT).engine_reason
 
 
 def free_body(shape: Shape, solid: Solid, kind: Any = Contact) -> Scene:

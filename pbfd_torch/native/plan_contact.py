@@ -22,11 +22,12 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What touches what, as `each_kind` in src/kinds.h has it: candidates are sorted by these.
-SOLIDS = (SphereSurface, SegmentSurface, BoxSurface, CylinderSurface, HeightSurface, DistanceGrid)
+CONVEX, UNEVEN = (SphereSurface, SegmentSurface, BoxSurface, CylinderSurface), (HeightSurface, DistanceGrid)
 POINT, BALL, ELLIPSOID = range(3)
 KINDS = (
     *((Plane, support) for support in (POINT, BALL, ELLIPSOID)),
-    *((solid, support) for support in (BALL, ELLIPSOID) for solid in SOLIDS),
+    *((solid, BALL) for solid in CONVEX + UNEVEN),
+    *((solid, ELLIPSOID) for solid in UNEVEN),  # on convex ones they touch as convex bodies do (terms/contact_terms.py)
 )
 PLANAR = 2  # of them, the first: what the core knows in a plane
 
@@ -142,6 +143,8 @@ class Candidates:
             return
         solid, first = self._solid(a, term, name), self.sizes[-1]
         if isinstance(term, CurvedContact):
+            if (type(term.surface), ELLIPSOID) not in KINDS:
+                raise unknown(f"curved bodies on '{name}', which is a {type(term.surface).__name__}")
             self._add_forms(a, term, name)
         for i in moving.tolist():
             if isinstance(term, CurvedContact):

@@ -22,8 +22,8 @@ struct Scene {
   Sizes sizes;
 
   explicit Scene(int kind) {
-    const bool plane = kind < 3, rim = kind == 2 || kind >= 9;
-    const int solid = plane ? -1 : (kind - 3) % 6, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
+    const bool plane = kind < 3, rim = kind == 2 || kind >= 9;  // see kinds.h
+    const int solid = plane ? -1 : kind < 9 ? kind - 3 : kind - 5, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
     whole = {-1, FREE, 0, 0, 1, 0, 1, 2, 3, 4, 5};  // how many dofs each dof rides on, and which
     for (int i = 0; i < NV; i++)
       for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);

@@ -11,7 +11,7 @@ struct CandidateSizes {
 };
 
 template <class N, int D> struct Candidates {
-  static constexpr int KINDS = D == 3 ? 15 : 2;  // of pairs, see kinds.h
+  static constexpr int KINDS = D == 3 ? 11 : 2;  // of pairs, see kinds.h
 
   const int* counts;                    // [KINDS] candidates of each kind of pair
   const int *carrier, *solid, *form;    // node; which plane, or which other solid; which ellipsoid

@@ -24,13 +24,11 @@ template <class N, int D, class F> inline void each_kind(const Candidates<N, D>&
   next(Pair<Plane, Point>()), next(Pair<Plane, Ball>());
   if constexpr (D == 3) {
     next(Pair<Plane, Ellipsoid>());
-    auto beside_others = [&](auto support) {  // a point there is a ball without a radius
-      using Support = decltype(support);
-      next(Pair<Placed<Globe>, Support>()), next(Pair<Placed<Pill>, Support>());
-      next(Pair<Placed<Block>, Support>()), next(Pair<Placed<Drum>, Support>());
-      next(Pair<Placed<Terrain>, Support>()), next(Pair<Placed<Sampled>, Support>());
-    };
-    beside_others(Ball()), beside_others(Ellipsoid());
+    // a point there is a ball without a radius
+    next(Pair<Placed<Globe>, Ball>()), next(Pair<Placed<Pill>, Ball>());
+    next(Pair<Placed<Block>, Ball>()), next(Pair<Placed<Drum>, Ball>());
+    next(Pair<Placed<Terrain>, Ball>()), next(Pair<Placed<Sampled>, Ball>());
+    next(Pair<Placed<Terrain>, Ellipsoid>()), next(Pair<Placed<Sampled>, Ellipsoid>());
   }
 }
 
