@@ -27,7 +27,7 @@ sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/nativ
 build/sanitized/%: tests/native/%.cpp $(wildcard tests/native/*.h) $(NATIVE)
 	mkdir -p $(@D)
 	$(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
-		-Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<
+		-Wno-bitwise-instead-of-logical -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<
 
 lint: .venv/.installed
 	$(BIN)/ruff check
