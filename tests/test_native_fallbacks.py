@@ -13,6 +13,7 @@ from torch import Tensor
 from pbfd_torch import Simulator
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
@@ -102,6 +103,27 @@ def test_what_is_tried_is_what_the_reference_tries() -> None:
     assert same_end >= 0.8 * judged
 
 
+@pytest.mark.parametrize("scheme", [Variational(), Variational(0.3)])
+def test_larger_shares_are_tried_in_turn(scheme: Variational) -> None:
+    """Steps that turn joints too far for the variational scheme: solved at the same share as the reference's they end alike."""
+    shares, alike = [], 0
+    for name, dt, _ in IMPLICIT_EULER:
+        simulator, native, state, controls = walked(name, dt, scheme)
+        states, _ = native.run(state, controls, LATER)
+        state, control = mapped(_last, states), controls[LATER]
+        after, solution, _ = native.made(state, control)
+        index = (solution.status == int(Status.EASED)).nonzero().squeeze(-1)[:JUDGED]
+        worlds = Worlds((WORLDS,), index)
+        end, found, _ = simulator.eager.take(worlds).made(state.take(worlds), control[index])
+        tried = solution.fallbacks[index, 2]
+        same = (found.status == int(Status.EASED)) & (found.fallbacks[:, 2] == tried)
+        shares += tried[same].tolist()
+        alike += int((same & ((end.q - after.q[index]).abs().amax(-1) < 1e-6)).sum())
+    assert len(shares) >= 10
+    assert len(set(shares)) > 1
+    assert alike >= 0.9 * len(shares)
+
+
 def _last(values: Tensor) -> Tensor:
     return values[-1]
 
@@ -123,11 +145,12 @@ def test_implicit_euler_is_led_along_detours(name: str, dt: float, steps: int) -
     assert int(detours[:2].sum()) > 0
 
 
+@pytest.mark.parametrize("scheme", [ImplicitEuler(), Variational(), Variational(0.3)])
 @pytest.mark.parametrize("dt", [0.005, 0.02])
 @pytest.mark.parametrize("name", ["chain-fixed", "chain-ground", "dzhanibekov", "hopper", "walker"])
-def test_implicit_euler_steps_as_the_reference(name: str, dt: float) -> None:
+def test_schemes_on_positions_step_as_the_reference(name: str, dt: float, scheme: ImplicitEuler) -> None:
     """From the same state to the same root, and on from it alike, where both solve the step directly."""
-    simulator, native, state, controls = walked(name, dt, ImplicitEuler())
+    simulator, native, state, controls = walked(name, dt, scheme)
     direct = same = 0
     for control in controls[:30]:
         state, _, _ = native.made(state, control)
@@ -144,7 +167,7 @@ def test_implicit_euler_steps_as_the_reference(name: str, dt: float) -> None:
     assert same >= 0.97 * direct > 0
 
 
-@pytest.mark.parametrize("integrator", [None, ImplicitEuler()])
+@pytest.mark.parametrize("integrator", [None, ImplicitEuler(), Variational()])
 @pytest.mark.parametrize("name", ["walker", "chain-ground"])
 def test_no_lane_knows_another_through_fallbacks(name: str, integrator: Any) -> None:
     """To the bit: in a batch, in another place of it, by itself, on threads, beside worlds that are not finite."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import State
+from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
@@ -38,6 +39,7 @@ class Scheme:
 SCHEMES: dict[type, Scheme] = {
     EnergyMomentum: Scheme("pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
     ImplicitEuler: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
+    Variational: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
 }
 
 
@@ -57,7 +59,7 @@ class _Plan(ctypes.Structure):
 
 class _Steps(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus")),
+        *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus", "share")),
         *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
         ("given", ctypes.c_void_p * 9),
         ("control", ctypes.c_void_p),
@@ -71,12 +73,13 @@ class _Steps(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Terms:
-    """What is asked of steps. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; evaluations: at most, of each with all
-    that is tried."""
+    """What is asked of steps. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; share: see `Variational`, 1 for
+    implicit Euler; evaluations: at most, of each with all that is tried."""
 
     dt: float
     tolerance: float
     surplus: float
+    share: float
     evaluations: int
 
 
@@ -106,7 +109,8 @@ class Journey:
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
-        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.evaluations, self._worlds, 0, self._worlds, self._steps)
+        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.share, terms.evaluations, self._worlds)
+        asked.last, asked.steps = self._worlds, self._steps
         asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
         asked.given[: len(self.given)] = [x.data_ptr() for x in self.given.values()]
         asked.found[: len(self.fields)] = [x.data_ptr() for x in self.fields.values()]

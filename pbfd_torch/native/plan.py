@@ -12,6 +12,7 @@ from torch import Tensor
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import Candidates, on_nodes
@@ -89,7 +90,7 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     a, scene = stepper.articulation, stepper.scene
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
-    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler):
+    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler, Variational):
         raise unknown(f"integrator {type(stepper.integrator).__name__}")
     if stepper.step_size.ndim:
         raise unknown("a step of its own for each world")

@@ -14,6 +14,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.core import SCHEMES, Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError
@@ -45,7 +46,8 @@ class NativeStepper(Generic[S]):
         scheme: object = eager.integrator
         surplus = scheme.surplus if isinstance(scheme, EnergyMomentum) else math.inf
         tolerance = Fallbacks().direct.tolerance_for(eager.articulation.dtype)
-        terms = Terms(eager.dt, tolerance, surplus, eager.evaluations)
+        share = scheme.share if isinstance(scheme, Variational) else 1.0
+        terms = Terms(eager.dt, tolerance, surplus, share, eager.evaluations)
         self._core = Core(compiled, plan, SCHEMES[type(scheme)], terms, self.threads)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -71,7 +71,7 @@ struct Run {
 
   void make(const Scene& scene, Step step, double dt) {
     void* room = std::aligned_alloc(64, (pbfd_room(&scene.plan) + 127) / 64 * 64);
-    pbfd_steps s{dt, 1e-9, 1e-3, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), nullptr};
+    pbfd_steps s{dt, 1e-9, 1e-3, 1, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), nullptr};
     for (std::size_t i = 0; i < given.size(); i++) s.given[i] = given[i].data(), s.found[i] = found[i].data();
     for (int i = 0; i < 4; i++) s.counted[i] = counted[i].data();
     step(&scene.plan, &s, room);

@@ -22,8 +22,8 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
   static constexpr int T = turns(D), S = T + D;
   using M = typename Kind<V>::Mask;
   using State = Velocities<V>;
-  static constexpr bool easier = true;  // inertia at the end of the step, as the paper has it
-  static constexpr double SHARE = 0.5;
+  static constexpr int easier = 1;  // inertia at the end of the step, as the paper has it
+  static double share(int eased) { return eased ? 1.0 : 0.5; }
 
   const Plan<N, D>& plan;
   V surplus_allowed;  // of the largest kinetic energy so far

@@ -1,4 +1,5 @@
-// Implicit Euler on positions, as integrators/implicit_euler.py: κ = 1/Δt², T̂ = 2T_n − T_{n−1} + Δt² [0 | g].
+// Implicit Euler on positions, as integrators/implicit_euler.py: κ = 1/Δt², T̂ = 2T_n − T_{n−1} + Δt² [0 | g]; and the variational
+// scheme (integrators/variational.py), which is the same with inertia at another share w of the chord.
 #pragma once
 #include "state.h"
 #include "strayed.h"
@@ -18,10 +19,11 @@ template <class V> struct Positions {
 template <class V, class N, int D> struct ImplicitEuler {
   using M = typename Kind<V>::Mask;
   using State = Positions<V>;
-  static constexpr bool easier = false;
-  static constexpr double SHARE = 1.0;
+  static constexpr double BLENDS[] = {0.25, 0.5, 0.75, 1.0};  // what is easier to solve
 
   const Plan<N, D>& plan;
+  int easier = 0;
+  double own_share = 1;  // w
   Poses<V> earlier;
   V *axes, *moved, *gained, *twist, *rates, *back;
 
@@ -32,7 +34,11 @@ template <class V, class N, int D> struct ImplicitEuler {
     twist = arena.take(6 * plan.nodes), rates = arena.take(12 * plan.nodes), back = arena.take(plan.nq);
   }
 
-  void ask(const Rules&) {}
+  void ask(const Rules& rules) {
+    own_share = rules.share, easier = 0;
+    for (double blend : BLENDS) easier += blend > own_share;
+  }
+  double share(int eased) const { return eased ? BLENDS[4 - easier + eased - 1] : own_share; }
 
   // Average over the step that ends at t_n (Eq. 3).
   void velocity(const State& x, V dt, V* out) const {
@@ -75,7 +81,7 @@ template <class V, class N, int D> struct ImplicitEuler {
     return M(false);
   }
 
-  // Never: there is nothing easier.
+  // Never: an easier step is good enough.
   V halves(const Balance<V, N, D>&, Sight<V, N, D>&, const State&, M) const { return V(0); }
 };
 

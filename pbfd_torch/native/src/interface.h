@@ -26,7 +26,9 @@ struct pbfd_plan {
 //   found: what is given, after each step, [steps, …];
 //   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].
 struct pbfd_steps {
-  double dt, tolerance, surplus;
+  double dt, tolerance;
+  double surplus;  // of energy–momentum
+  double share;    // of the chord at which inertia works: 1 implicit Euler, less the variational scheme
   int evaluations;  // at most, of each world in each step, with all that is tried
   int worlds, first, last;
   int steps, held;

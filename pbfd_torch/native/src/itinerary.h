@@ -1,5 +1,5 @@
 // How a world makes its step where the first attempt fails, as stepping/eager.py: for one lane, what it tries next. That is, in
-// turn: shorter steps where these are worth more than an easier one, the scheme's easier step, and 2, 4, 8 … shorter steps.
+// turn: shorter steps where these are worth more than an easier one, the scheme's easier steps, and 2, 4, 8 … shorter steps.
 #pragma once
 #include "fallbacks.h"
 #include "state.h"
@@ -12,12 +12,11 @@ enum Fallback { WARM_START, CONTINUATION, EASIER_STEP, HALVING, FALLBACKS };  //
 // again as an easier one or from the first of shorter parts on, or the same part as an easier one; or the next part follows.
 enum Then { END, END_AT_BEST, END_OF_PARTS, EASE, HALVE, EASE_PART, NEXT_PART };
 
-template <class T, bool EASIER> struct Itinerary {
-  static constexpr int FIRST = EASIER ? SOON : DIRECT;  // evaluations of a first attempt: detours come later, if at all
-
+template <class T> struct Itinerary {
+  int easier;  // how many easier steps the scheme has
   // the attempt
   int halvings, part;  // of 2^halvings parts; 0: of the whole step
-  bool eased;
+  int eased;           // which of the easier steps it is; 0: the step itself
   int limit, share;  // what `evaluations` may reach in it; what each part may spend
   // the step
   int tried, wanted;
@@ -27,9 +26,9 @@ template <class T, bool EASIER> struct Itinerary {
   int status, hazards;
   T error;
 
-  void begin(const Rules& rules) {
-    halvings = part = tried = wanted = evaluations = iterations = hazards = 0;
-    eased = false, limit = rules.evaluations;
+  void begin(const Rules& rules, int steps) {
+    halvings = part = tried = wanted = evaluations = iterations = hazards = eased = 0;
+    easier = steps, limit = rules.evaluations;
     for (int& x : counts) x = 0;
   }
 
@@ -37,9 +36,11 @@ template <class T, bool EASIER> struct Itinerary {
   bool first() const { return tried == 0; }
   // Whether it goes through all detours, and whether these count as the step's own. Where not, roots that have strayed are good
   // enough.
-  bool led() const { return eased || !EASIER; }
+  bool led() const { return eased == easier; }
   bool own() const { return whole() && !eased; }
   bool affords(int cost) const { return evaluations + cost <= limit; }
+  // What a first attempt may cost, which is the last of all: detours come with that.
+  int attempt(int which) const { return which == easier ? DIRECT : SOON; }
 
   // An attempt has ended like this. `wanted`, of a first attempt that failed, is known.
   Then after(const Rules& rules, int ended, T reached, int found) {
@@ -57,34 +58,35 @@ template <class T, bool EASIER> struct Itinerary {
 
   Then after_part(const Rules& rules, int ended, T reached, int found) {
     if (ended <= HALVED) {
-      eased = false, parts_hazards |= found, parts_error = max(parts_error, reached);
+      eased = 0, parts_hazards |= found, parts_error = max(parts_error, reached);
       if (++part == 1 << halvings) return status = HALVED, error = parts_error, hazards = parts_hazards, END_OF_PARTS;
       return begin_part(), NEXT_PART;
     }
-    if (EASIER && !eased && may_ease && ended != NON_FINITE && affords(DIRECT)) return eased = true, EASE_PART;
+    if (eased < easier && may_ease && ended != NON_FINITE && affords(attempt(eased + 1))) return eased++, EASE_PART;
     return further(rules);  // where one part fails, so do all
   }
 
   void begin_part() { limit = evaluations + share; }
 
   Then further(const Rules& rules) {
-    limit = rules.evaluations, eased = false, halvings = part = 0;
-    const int easing = rules.halvings + 1, last = 2 * rules.halvings + 1;
+    limit = rules.evaluations, eased = 0, halvings = part = 0;
+    const int easing = rules.halvings, last = easing + easier + rules.halvings;
     while (++tried <= last) {
-      const int times = tried < easing ? tried : tried - easing;
-      if (tried == easing) {
-        if (!EASIER || !affords(DIRECT)) continue;
-        counts[EASIER_STEP]++, eased = true;
+      const bool early = tried <= easing;
+      const int times = early ? tried : tried - easing - easier;
+      if (!early && times <= 0) {
+        if (!affords(attempt(times + easier))) continue;
+        counts[EASIER_STEP]++, eased = times + easier;
         return EASE;
       }
       // as long as still shorter steps are to be tried, none of these may be an easier one
-      if ((tried < easing && times > wanted) || !affords(FIRST << times)) continue;
-      may_ease = tried > easing || times == wanted;
+      if ((early && times > wanted) || !affords(attempt(0) << times)) continue;
+      may_ease = !early || times == wanted;
       counts[HALVING]++, halvings = times, share = (limit - evaluations) >> times;
       parts_hazards = 0, parts_error = T(0);
       return begin_part(), HALVE;
     }
-    if (!EASIER && error <= T(rules.tolerance)) status = SOLVED;  // a root that has strayed is better than none
+    if (!easier && error <= T(rules.tolerance)) status = SOLVED;  // a root that has strayed is better than none
     return END_AT_BEST;
   }
 };

@@ -7,7 +7,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 4; }
+int pbfd_interface() { return 5; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -28,7 +28,7 @@ void make(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
   const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
                            static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
-  machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, p->halvings, s->evaluations}, s->first, s->last);
+  machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, s->share, p->halvings, s->evaluations}, s->first, s->last);
 }
 
 template <class T, int D>

@@ -67,7 +67,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   // of each lane
   int world[W];  // −1: none
   int step[W];   // of that world
-  Itinerary<T, Scheme::easier> trips[W];
+  Itinerary<T> trips[W];
   Fallbacks<T> ways[W];
   bool plainly[W];  // it is posed the step itself
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
@@ -92,7 +92,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     depart(i);
     return more;
   }
-  void depart(int i) { steer(i), trips[i].begin(rules), attempt(i); }
+  void depart(int i) { steer(i), trips[i].begin(rules, scheme.easier), attempt(i); }
   void attempt(int i) { ways[i].begin(), pose(i); }
 
   // What a lane is to solve next. Most have just made a step, and are to make one.
@@ -104,7 +104,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const int halvings = trips[i].halvings;
     const Stage problem = ways[i].problem();
     const Start start = ways[i].start();
-    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(trips[i].eased ? 1.0 : Scheme::SHARE));
+    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(scheme.share(trips[i].eased)));
     for (int j = 0; j < plan.nv; j++) put(b.fitted[j], i, lane(plan.share[halvings * plan.nv + j], i));
     put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
     put(b.relaxed.length, i, T(problem.length)), put(b.relaxed.lagged, i, problem.lagged);

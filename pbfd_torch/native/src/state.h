@@ -6,7 +6,7 @@
 namespace pbfd {
 
 struct Rules {
-  double dt, tolerance, surplus;  // [s], of ‖r/scale‖, see `EnergyMomentum`
+  double dt, tolerance, surplus, share;  // [s], of ‖r/scale‖, see `EnergyMomentum`, see `Variational`
   int halvings, evaluations;      // how often a step may be halved; at most, with all that is tried
 };
 
