@@ -27,7 +27,7 @@ def gaps(scene: Scene, state: Velocities, q: Tensor, control: Tensor | None = No
     """How far the core's r and J at q are from the reference's, `[worlds]` each: of the largest entry."""
     simulator = Simulator(scene, DT)
     native = NativeStepper(simulator.eager)
-    residual, jacobian = native._core.balance(state, control, q)
+    residual, jacobian = native._core.balance(native.complete(state), control, q)
     balance = simulator.eager.objective(state, control).evaluate(q)
     pairs = ((residual, balance.residual), (jacobian.flatten(-2), balance.jacobian.flatten(-2)))
     first, second = ((ours - theirs).abs().amax(-1) / theirs.abs().amax(-1) for ours, theirs in pairs)

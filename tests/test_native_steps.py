@@ -157,7 +157,6 @@ def test_a_plane_is_space_with_less(name: str, tmp_path: Path, monkeypatch: pyte
     ("name", "changes", "words"),
     [
         ("stack", {}, "BodyContact"),
-        ("arch", {}, "AnchoredFriction"),
         ("hopper", {"integrator": Bdf2()}, "Bdf2"),
     ],
 )

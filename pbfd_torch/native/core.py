@@ -8,6 +8,7 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,7 +50,7 @@ class _Plan(ctypes.Structure):
             (name, ctypes.c_int)
             for name in (
                 *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
-                *("candidates", "planes", "solids", "samples", "forms", "pushes"),
+                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes"),
             )
         ),
         ("whole", ctypes.c_void_p),
@@ -61,9 +62,9 @@ class _Steps(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus", "share")),
         *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
-        ("given", ctypes.c_void_p * 9),
+        ("given", ctypes.c_void_p * 10),
         ("control", ctypes.c_void_p),
-        ("found", ctypes.c_void_p * 9),
+        ("found", ctypes.c_void_p * 10),
         ("residual_norm", ctypes.c_void_p),
         ("counted", ctypes.c_void_p * len(COUNTED)),
         ("fallbacks", ctypes.c_void_p),
@@ -89,23 +90,30 @@ class Journey:
     Attributes:
         given: the fields of the state `[*batch, ...]` that each world sets out from.
         control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
-        fields: of the state after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
+        fields: of the state after each step, with its memory, `[*steps, *batch, ...]`; steps: how many, or nothing for a single
+            one.
         residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
     """
 
-    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: tuple[int, ...], grip: Tensor | None) -> None:
+    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: tuple[int, ...], plan: Plan) -> None:
         batch = tuple(state.q.shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
         self.given = {name: _whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in scheme.vectors}
         self.given |= {name: _whole(getattr(state, name), batch) for name in scheme.numbers}
+        if any(plan.anchors):
+            self.given["memory"] = _whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
         self.control = _whole(control, (len(control), *batch, control.shape[-1]))
-        self.grip = None if grip is None else _whole(grip, (*batch, grip.shape[-1]))
-        self.fields = {name: _room_for(x, steps) for name, x in self.given.items()}
+        self.grip = None if plan.grip is None else _whole(plan.grip, (*batch, plan.grip.shape[-1]))
+        self.found = {name: _room_for(x, steps) for name, x in self.given.items()}
         self.residual_norm = state.q.new_empty((*steps, *batch))
         first, *others = COUNTED
         self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
         self.counted |= {name: torch.empty_like(self.counted[first]) for name in others}
         self.fallbacks = torch.empty((*steps, *batch, len(FALLBACKS)), dtype=torch.int32)
+        memory = tuple(x.expand(*steps, *x.shape) for x in state.memory)  # there is nothing in it without anchors
+        if any(plan.anchors):
+            memory = self.found["memory"].split(plan.anchors, -2)
+        self.fields: dict[str, Any] = self.found | {"memory": memory}
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
@@ -113,7 +121,7 @@ class Journey:
         asked.last, asked.steps = self._worlds, self._steps
         asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
         asked.given[: len(self.given)] = [x.data_ptr() for x in self.given.values()]
-        asked.found[: len(self.fields)] = [x.data_ptr() for x in self.fields.values()]
+        asked.found[: len(self.found)] = [x.data_ptr() for x in self.found.values()]
         asked.counted[:] = [x.data_ptr() for x in self.counted.values()]
         asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
         if self.grip is not None:
@@ -158,7 +166,7 @@ class Core:
     def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
-        journey = Journey(self._scheme, state, control, steps, self.plan.grip)
+        journey = Journey(self._scheme, state, control, steps, self.plan)
         asked = journey.call(self._terms)
         blocks = min(BLOCKS * self._threads, asked.worlds * asked.steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
         if self._threads == 1 or blocks < 2:
@@ -189,7 +197,7 @@ class Core:
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(self._scheme, state, held, (), self.plan.grip)
+        journey = Journey(self._scheme, state, held, (), self.plan)
         at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         room = self._room()

@@ -37,13 +37,15 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 @dataclass(frozen=True, eq=False)
 class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
-    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ."""
+    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ. anchors: how
+    many each contact has, in the order of a state's memory."""
 
     sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
     dimension: int
     grip: Tensor | None
+    anchors: tuple[int, ...]
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -82,7 +84,9 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
     sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
-    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), flat, 3 if plane is None else 2, candidates.grip)
+    dimension = 3 if plane is None else 2
+    whole_numbers = torch.tensor(whole, dtype=torch.int32)
+    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, tuple(candidates.anchors))
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:

@@ -15,9 +15,11 @@ from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSu
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plane import Plane as MotionPlane
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.coulomb_friction import CoulombFriction, DryFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
@@ -48,13 +50,14 @@ class Candidates:
     """Of all contact terms.
 
     Attributes:
-        indices: node, solid and form of each candidate of each kind.
+        indices: node, solid, form and place among the anchors (−1: none) of each candidate of each kind.
         rows: the numbers of some candidates of each kind, `[n, …]` each. grips: their μ, `[*batch, n]`.
         planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
             thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
+        anchors: how many each contact has: none, or one for each candidate, those of links that ride on the world too.
     """
 
-    indices: list[list[tuple[int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    indices: list[list[tuple[int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
     grips: list[list[Tensor]] = field(default_factory=lambda: [[] for _ in KINDS])
     planes: list[Tensor] = field(default_factory=list)
@@ -62,12 +65,14 @@ class Candidates:
     solids: list[Sequence[Tensor]] = field(default_factory=list)
     samples: list[Tensor] = field(default_factory=list)
     forms: list[Sequence[Tensor]] = field(default_factory=list)
+    anchors: list[int] = field(default_factory=list)
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of src/candidates.h: candidates, planes, solids, samples, forms."""
+        """Of src/candidates.h: candidates, anchors, planes, solids, samples, forms."""
         forms = sum(len(form) for form, _, _ in self.forms)
-        return sum(map(len, self.indices)), len(self.planes), len(self.solids), sum(map(len, self.samples)), forms
+        samples = sum(map(len, self.samples))
+        return sum(map(len, self.indices)), sum(self.anchors), len(self.planes), len(self.solids), samples, forms
 
     @property
     def normals(self) -> list[Tensor]:
@@ -76,16 +81,16 @@ class Candidates:
 
     @property
     def flat(self) -> bool:
-        """Whether they are points and balls beside half-spaces only."""
-        return not any(self.indices[PLANAR:])
+        """Whether they are points and balls beside half-spaces only, without anchors."""
+        return not any(self.indices[PLANAR:]) and not any(self.anchors)
 
     def within(self, plane: MotionPlane) -> Candidates:
         """The same in a plane, where they are `flat`."""
         rows: list[list[Sequence[Tensor]]] = []
         for indices, row in zip(self.indices, self.rows, strict=True):
-            rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, _, _), x in zip(indices, row, strict=True)])
+            rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, *_), x in zip(indices, row, strict=True)])
         planes = [torch.cat((x[:3] @ plane.basis, x[3:])) for x in self.planes]
-        return Candidates(self.indices[:PLANAR], rows, self.grips, planes)
+        return Candidates(self.indices[:PLANAR], rows, self.grips, planes, anchors=self.anchors)
 
     def whole(self) -> list[int]:
         """The index tables."""
@@ -111,8 +116,7 @@ class Candidates:
         law, friction = term.normal_force, term.friction
         if type(law) is not NormalForce or law.exponent != 2.0:
             raise unknown(f"normal force on '{name}' with another exponent than 2")
-        if type(friction) is not CoulombFriction and friction is not None:
-            raise unknown(type(friction).__name__)
+        width, anchored = _width(friction), isinstance(friction, AnchoredFriction)
         if term.restitution is not None:
             raise unknown("restitution")
         if term.position.ndim != 2 or term.radius.ndim != 1 or term.margin.ndim != 1:
@@ -126,7 +130,7 @@ class Candidates:
                 raise _differing(name)
             return number.expand(len(nodes))
 
-        mu = 0.0 if friction is None else friction.mu
+        mu = friction.mu if isinstance(friction, DryFriction) else 0.0
         grip = torch.as_tensor(mu if term.grip is None else mu * term.grip, dtype=a.dtype)
         grip = grip.expand(*grip.shape[:-1], len(nodes))
         numbers = (
@@ -137,8 +141,10 @@ class Candidates:
             grip.reshape(-1, len(nodes))[0],  # where worlds differ they bring their own
             each(term.deep, torch.finfo(a.dtype).max),
             each(law.release, 0.0),
-            each(None if friction is None else friction.slip_speed, 1.0),
+            each(width, 1.0),
         )
+        anchor = sum(self.anchors)
+        self.anchors.append(len(nodes) if anchored else 0)
         if len(moving) == 0:
             return
         solid, first = self._solid(a, term, name), self.sizes[-1]
@@ -153,7 +159,7 @@ class Candidates:
                 flat = isinstance(term.surface, Plane) and not bool(term.radius[i] > 0)
                 support, form = (POINT if flat else BALL), 0
             kind = KINDS.index((type(term.surface), support))
-            self.indices[kind].append((nodes[i] - 1, solid, form))
+            self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
             self.rows[kind].append([x[i, None] for x in numbers])
             self.grips[kind].append(grip[..., i, None])
 
@@ -177,7 +183,10 @@ class Candidates:
             case SegmentSurface():
                 start, end = _one(surface.start, 3, name), _one(surface.end, 3, name)
                 size[0], size[1] = _one(surface.radius, 1, name)[0], 0.5 * torch.linalg.vector_norm(end - start)
-                frame = frame @ _along(start, end)
+                along = _along(start, end)
+                if any(self.anchors[-1:]) and not torch.equal(along[:3, :3], torch.eye(3, dtype=a.dtype)):
+                    raise unknown(f"anchors on '{name}', a capsule that does not lie along z")
+                frame = frame @ along
             case BoxSurface():
                 size[:3] = _one(surface.half_extents, 3, name)
             case CylinderSurface():
@@ -211,6 +220,17 @@ class Candidates:
 
 def _differing(name: str) -> NotCompiledError:
     return unknown(f"contact with '{name}' of its own for each world")
+
+
+def _width(friction: FrictionLaw | None) -> float:
+    """What friction is smooth below: a slip speed [m/s], or the stretch of an anchor [m]; 1 without friction."""
+    if friction is None:
+        return 1.0
+    if type(friction) is CoulombFriction:
+        return friction.slip_speed
+    if type(friction) is AnchoredFriction:
+        return friction.stretch
+    raise unknown(type(friction).__name__)
 
 
 def _one(value: Tensor, count: int, name: str) -> Tensor:

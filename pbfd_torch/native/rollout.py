@@ -25,6 +25,7 @@ def rolled_out(
 ) -> Rollout:
     """See `Simulator.rollout`. Progress is told of each step when a few of them are done."""
     count = stepper.scene.step_count(controls, steps)
+    state = stepper.complete(state)
     recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, state)
     batch = state.q.shape[:-1]
     most = max(1, AT_ONCE // max(1, state.q[..., 0].numel()))

@@ -9,7 +9,7 @@ from typing import Any, Generic
 import torch
 from torch import Tensor
 
-from pbfd_torch.balance.objective import BalanceObjective
+from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
@@ -100,21 +100,23 @@ class NativeStepper(Generic[S]):
         after each, `[steps, *batch, ...]`, and how each was solved."""
         journey = self._went(state, controls, (steps,))
         time = torch.cat((state.time[None], self.step_size.expand(steps, *state.time.shape))).cumsum(0)[1:]
-        remembered = tuple(x.expand(steps, *x.shape) for x in state.memory)  # by terms that the core does not know
         hazards = journey.counted["hazards"]
-        return replaced(state, **journey.fields, time=time, hazards=hazards, memory=remembered), journey.solution
+        return replaced(state, **journey.fields, time=time, hazards=hazards), journey.solution
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
         """The states after steps, and how these were solved."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        return self._core.go(self._complete(state), spread(controls, state.q.shape[:-1]), steps)
+        return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps)
 
-    def _complete(self, state: S) -> S:
-        """With zero for an acceleration that is not known."""
+    def complete(self, state: S) -> S:
+        """With zero for an acceleration that is not known, and anchors where there is nothing in the memory yet."""
+        batch = state.q.shape[:-1]
+        if any(self._core.plan.anchors) and not state.memory:
+            state = replaced(state, memory=blank_memory(self.eager.terms, batch))
         if not isinstance(state, Positions) or state.acceleration is not None:
             return state
-        return replaced(state, acceleration=state.q.new_zeros(*state.q.shape[:-1], self.scene.articulation.nv))
+        return replaced(state, acceleration=state.q.new_zeros(*batch, self.scene.articulation.nv))
 
     def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
         """See `Stepper`."""

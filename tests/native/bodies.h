@@ -18,6 +18,7 @@ using Numbers = std::vector<double>;
 struct Body {
   double mass, inertia[3], radius;
   Numbers positions;  // [3] each
+  bool anchored = false;
 };
 
 struct Scene {
@@ -36,6 +37,7 @@ struct Scene {
       for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);
     for (int kind = 0; kind < pbfd::Candidates<double, 3>::KINDS; kind++) whole.push_back(kind == (b.radius > 0) ? candidates : 0);
     whole.insert(whole.end(), 3 * candidates, 0);  // all on node 0, all against plane 0
+    for (int i = 0; i < candidates; i++) whole.push_back(b.anchored ? i : -1);
     add({1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, b.mass, 0, 0, 0});
     add({sum - b.inertia[0], 0, 0, 0, sum - b.inertia[1], 0, 0, 0, sum - b.inertia[2], b.mass});
     const double weight = b.mass * G, reach = 0.1;
@@ -45,8 +47,8 @@ struct Scene {
     each(-inf, -inf), each(inf, inf), each(0, 0), add({0, 0, 0, 1, 0, 0, 0});
     add({0, 0, -G, reach, 1, 0, 1e-3});
     real.insert(real.end(), b.positions.begin(), b.positions.end());
-    all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(0.1), all(1e-3), add({0, 0, 1, 0});
-    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, 1, 0, 0, 0, 0, whole.data(), real.data()};
+    all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(0.1), all(b.anchored ? 1e-4 : 1e-3), add({0, 0, 1, 0});
+    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, whole.data(), real.data()};
     CHECK(pbfd_whole_numbers(&plan) == long(whole.size()));
     CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   }

@@ -21,14 +21,14 @@ struct Scene {
   std::vector<double> real;
   Sizes sizes;
 
-  explicit Scene(int kind) {
+  Scene(int kind, bool anchored) {
     const bool plane = kind < 3, rim = kind == 2 || kind >= 9;  // see kinds.h
     const int solid = plane ? -1 : kind < 9 ? kind - 3 : kind - 5, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
     whole = {-1, FREE, 0, 0, 1, 0, 1, 2, 3, 4, 5};  // how many dofs each dof rides on, and which
     for (int i = 0; i < NV; i++)
       for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);
     for (int k = 0; k < KINDS; k++) whole.push_back(k == kind);
-    whole.insert(whole.end(), {0, 0, 0});  // carrier, solid, form
+    whole.insert(whole.end(), {0, 0, 0, anchored ? 0 : -1});  // carrier, solid, form, anchor
     if (!plane) whole.insert(whole.end(), {0, CELLS, CELLS, solid == 5 ? CELLS : 1});
     real = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, MASS, 0.01, 0, 0.02, SECOND, 0, 0, 0, SECOND, 0, 0, 0, 2 * SECOND, MASS};
     auto each = [&](double straight, double turning) {
@@ -39,7 +39,7 @@ struct Scene {
     each(-INF, -INF), each(INF, INF), each(0, 0);
     real.insert(real.end(), {0, 0, 0, 1, 0, 0, 0});
     real.insert(real.end(), {0, 0, -9.81, 0.2, 1, 0, 1e-3});
-    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 0.3, 1e-2});
+    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 0.3, anchored ? 1e-3 : 1e-2});
     if (plane) real.insert(real.end(), {0, 0, 1, 1});
     if (!plane) {
       real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == 4 ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
@@ -50,7 +50,7 @@ struct Scene {
         real.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
     }
     if (rim) real.insert(real.end(), {0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.03, 0, 1, 0, 0});
-    sizes = {{1, plane, !plane, samples, rim}, 1, NQ, NV, 0, 0, 0};
+    sizes = {{1, anchored, plane, !plane, samples, rim}, 1, NQ, NV, 0, 0, 0};
     CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));
     CHECK(Plan<double>::real_numbers(sizes) == int(real.size()));
   }
@@ -80,8 +80,8 @@ void start(double* q, int world, double height) {
   quaternion_exp(turn, q + 3);
 }
 
-void of_kind(int kind) {
-  const Scene scene(kind);
+void of_kind(int kind, bool anchored) {
+  const Scene scene(kind, anchored);
   const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data());
   const double height = scene.sizes.forms ? 1.15 : 1.17;
   using V = Lanes<double, 4>;
@@ -95,6 +95,9 @@ void of_kind(int kind) {
   double v[NV], room[18];
   V q_all[NQ], v_all[NV], room_all[18];
   int touched = 0;
+  const double behind[3] = {4e-4, -3e-4, 2e-4};
+  const V behind_all[3] = {V(behind[0]), V(behind[1]), V(behind[2])};
+  b.contacts.behind = moved.contacts.behind = behind, all.contacts.behind = behind_all;
   for (int world = 0; world < WORLDS; world++) {
     double q[NQ], d[NV], shifted[NQ];
     start(q, world, height);
@@ -144,7 +147,7 @@ void of_kind(int kind) {
 int main() {
   for (int kind = 0; kind < KINDS; kind++) {
     const int before = failures();
-    of_kind(kind);
+    for (bool anchored : {false, true}) of_kind(kind, anchored);
     if (failures() > before) std::fprintf(stderr, "kind %d\n", kind);
   }
   return failures();

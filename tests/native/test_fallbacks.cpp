@@ -1,5 +1,5 @@
 // A plate is thrown at the ground in long steps, spinning fast: they are refused, made easier, halved, led along detours, by both
-// schemes; in a register of worlds and in worlds by themselves, which agree to the bit.
+// schemes; in a register of worlds and in worlds by themselves, which agree to the bit. Its corners have anchors.
 #include "bodies.h"
 
 #include <cmath>
@@ -8,11 +8,13 @@ using namespace bodies;
 
 namespace {
 
-constexpr int WORLDS = 19, STEPS = 30;
+constexpr int WORLDS = 19, STEPS = 30, CORNERS = 4;
 
 Run thrown(int first, int count, Step step, const std::vector<int>& widths, double dt) {
-  const Scene scene({1.0, {0.004, 0.002, 0.0055}, 0, {0.15, 0.1, 0, 0.15, -0.1, 0, -0.15, 0.1, 0, -0.15, -0.1, 0}});
-  Run run(count, STEPS, widths);
+  const Scene scene({1.0, {0.004, 0.002, 0.0055}, 0, {0.15, 0.1, 0, 0.15, -0.1, 0, -0.15, 0.1, 0, -0.15, -0.1, 0}, true});
+  std::vector<int> with_memory = widths;
+  with_memory.push_back(3 * CORNERS);
+  Run run(count, STEPS, with_memory);
   for (int w = 0; w < count; w++) {
     const int k = first + w;
     double *q = run.given[0].data() + w * NQ, *other = run.given[1].data() + w * widths[1];

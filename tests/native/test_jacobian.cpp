@@ -42,7 +42,7 @@ std::vector<double> real_numbers() {
 }  // namespace
 
 int main() {
-  const Sizes sizes{{0, 0, 0, 0, 0}, NODES, NQ, NV, 0, 0, 0};
+  const Sizes sizes{{0, 0, 0, 0, 0, 0}, NODES, NQ, NV, 0, 0, 0};
   const std::vector<int> whole = whole_numbers();
   const std::vector<double> real = real_numbers();
   CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));

@@ -5,9 +5,9 @@
 
 namespace pbfd {
 
-// How many there are: of candidates, and of what several of them share.
+// How many there are: of candidates, of what anchors remember, and of what several candidates share.
 struct CandidateSizes {
-  int candidates, planes, solids, samples, forms;
+  int candidates, anchors, planes, solids, samples, forms;
 };
 
 template <class N, int D> struct Candidates {
@@ -15,9 +15,10 @@ template <class N, int D> struct Candidates {
 
   const int* counts;                    // [KINDS] candidates of each kind of pair
   const int *carrier, *solid, *form;    // node; which plane, or which other solid; which ellipsoid
+  const int* anchor;                    // its place among what anchors remember; −1: it has none
   const N *position, *radius, *margin;  // [D] on the node, [1], [1]
   const N *firmness, *grip, *deep;      // C⊥, μ, from which depth on it is a hazard
-  const N *release, *slip_speed;        // [m/s]
+  const N *release, *width;             // [m/s]; of friction [m/s], or the stretch [m] of an anchor
   const N* plane;                       // [D + 1] of a half-space: normal and offset in the world
   // of another solid: rotation and position in the world [12], its sizes [6], its thickness where it is convex; what is sampled
   // has its samples from the first number of `grid` [4] on, so many along each axis as the others say
@@ -31,15 +32,15 @@ template <class N, int D> struct Candidates {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
     const int n = s.candidates;
-    counts = whole(KINDS), carrier = whole(n), solid = whole(n), form = whole(n), grid = whole(4 * s.solids);
+    counts = whole(KINDS), carrier = whole(n), solid = whole(n), form = whole(n), anchor = whole(n), grid = whole(4 * s.solids);
     position = real(D * n), radius = real(n), margin = real(n);
-    firmness = real(n), grip = real(n), deep = real(n), release = real(n), slip_speed = real(n);
+    firmness = real(n), grip = real(n), deep = real(n), release = real(n), width = real(n);
     plane = real((D + 1) * s.planes);
     frame = real(12 * s.solids), measure = real(6 * s.solids), thickness = real(s.solids), sample = real(s.samples);
     ellipsoid = real(9 * s.forms), axis = real(3 * s.forms), lying = real(s.forms);
   }
 
-  static int whole_numbers(CandidateSizes s) { return KINDS + 3 * s.candidates + 4 * s.solids; }
+  static int whole_numbers(CandidateSizes s) { return KINDS + 4 * s.candidates + 4 * s.solids; }
   static int real_numbers(CandidateSizes s) {
     return (7 + D) * s.candidates + (D + 1) * s.planes + 19 * s.solids + s.samples + 13 * s.forms;
   }

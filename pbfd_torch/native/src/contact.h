@@ -16,6 +16,7 @@ template <class V, class N, int D> struct Contacts {
   V* grip;                           // μ [candidates]
   const Relaxed<V>& relaxed;
   // what is fixed in a step
+  const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
   Poses<V> before;  // of the nodes at its start
   V per_dt;
   V* share;  // of its normal force that a candidate gives
@@ -84,6 +85,18 @@ template <class V, class N, int D> struct Contacts {
     });
   }
 
+  // What the anchors are behind by after a step of the step's own problem that ended where the nodes are now: w, cut to the stretch;
+  // nothing where the contact has opened (terms/anchored_friction.py).
+  [[gnu::noinline]] void remember(V* kept) {
+    if constexpr (D == 3) {
+      for (int j = 0; j < 3 * plan.anchors; j++) kept[j] = V(0);
+      each_kind(candidates, [&](auto pair, int first, int last) {
+        for (int i = first; i < last; i++)
+          if (anchored(i)) keep(pair, i, kept + 3 * candidates.anchor[i]);
+      });
+    }
+  }
+
   // What is too deep, and who touches something and has turned by more than a quarter turn.
   void look_for_hazards(M& deep, M& far) const {
     each_kind(candidates, [&](auto pair, int first, int last) {
@@ -143,13 +156,19 @@ template <class V, class N, int D> struct Contacts {
     center(i, before, c);
     t.start = depth(Pair(), i, before, c, solid);
     for (int j = 0; j < D; j++) t.moved[j] = t.center[j] - c[j];
+    if constexpr (D == 3)
+      if (anchored(i)) {
+        V stretched[3];
+        Pair::Surface::to_world(candidates, i, behind + 3 * candidates.anchor[i], stretched);
+        for (int j = 0; j < 3; j++) t.moved[j] += stretched[j];
+      }
     Pair::Surface::bend(candidates, i, t.center, t.solid, t.bend);
     if constexpr (Pair::Surface::convex)
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
     t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
     t.per_range = per_dt * V(N(1) / candidates.release[i]);
-    t.per_width = per_dt * V(N(1) / candidates.slip_speed[i]) / relaxed.width;
+    t.per_width = (anchored(i) ? V(1) : per_dt) * V(N(1) / candidates.width[i]) / relaxed.width;
     t.relaxed = &relaxed;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
@@ -159,6 +178,23 @@ template <class V, class N, int D> struct Contacts {
 
  private:
   static constexpr int T = turns(D);
+
+  // Scenes with anchors are seen in space.
+  bool anchored(int i) const { return D == 3 && candidates.anchor[i] >= 0; }
+
+  template <class Pair> void keep(Pair pair, int i, V* kept) {
+    Touching<V, D> t;
+    center(i, now, t.center);
+    t.depth = depth(pair, i, now, t.center, t.solid);
+    const M holds = t.depth > V(0);
+    if (!any(holds)) return;
+    touch(pair, i, t);
+    V w[D];
+    t.template slip<typename Pair::Support>(w);
+    const V stretch = V(candidates.width[i]), part = stretch / max(sqrt(dot<D>(w, w)), stretch);
+    for (int j = 0; j < D; j++) w[j] = select(holds, part * w[j], V(0));
+    Pair::Surface::to_own(candidates, i, w, kept);
+  }
 
   [[gnu::noinline]] void turn(int k) {
     rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turned_by + T * k);

@@ -8,13 +8,14 @@ namespace pbfd {
 constexpr double FLATTEST = 0.3, FARTHEST = 2.0, EXCESS = 1e-2, NOISE = 1e-4, RESERVE = 1e-2;
 constexpr double PATIENCE = 3, FAST = 1.9106729782512120;  // halvings; 2 cos(.3 rad), of the trace of a rotation by so much
 
-// Attributes as of `Velocities` in Python, [nq], [nv] each, and three energies.
+// Attributes as of `Velocities` in Python, [nq], [nv] each, three energies, and its memory.
 template <class V> struct Velocities {
-  V *q, *v, *push, *steady, *lag, *average, *gained, *surplus, *peak;
+  V *q, *v, *push, *steady, *lag, *average, *gained, *surplus, *peak, *behind;
   template <class F> static void each(Sizes s, F&& visit) {
     using X = Velocities;
     visit(&X::q, s.nq), visit(&X::v, s.nv), visit(&X::push, s.nv), visit(&X::steady, s.nv), visit(&X::lag, s.nv);
     visit(&X::average, s.nv), visit(&X::gained, 1), visit(&X::surplus, 1), visit(&X::peak, 1);
+    visit(&X::behind, 3 * s.anchors);
   }
 };
 

@@ -8,11 +8,12 @@ namespace pbfd {
 
 constexpr double HARDEST = 3.0;  // a gain of velocity is no impact's that has no more energy than a fall of so many steps
 
-// Attributes as of `Positions` in Python, [nq] and [nv].
+// Attributes as of `Positions` in Python, [nq] and [nv], and its memory.
 template <class V> struct Positions {
-  V *q, *q_previous, *acceleration;
+  V *q, *q_previous, *acceleration, *behind;
   template <class F> static void each(Sizes s, F&& visit) {
     visit(&Positions::q, s.nq), visit(&Positions::q_previous, s.nq), visit(&Positions::acceleration, s.nv);
+    visit(&Positions::behind, 3 * s.anchors);
   }
 };
 

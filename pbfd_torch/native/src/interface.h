@@ -14,14 +14,14 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
-  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, planes, solids, samples, forms, pushes;
+  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, anchors, planes, solids, samples, forms, pushes;
   const int* whole;
   const void* real;
 };
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
 //   given: of the state that each world goes on from: q, v, push, steady, lag, average, gained, surplus, peak (`Velocities`), or q,
-//     q_previous, acceleration (`Positions`);
+//     q_previous, acceleration (`Positions`); and behind, [3 · anchors] of its memory, where there are any;
 //   control: [worlds, nu] for all steps if `held`, else [steps, worlds, nu];
 //   found: what is given, after each step, [steps, …];
 //   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].
@@ -32,9 +32,9 @@ struct pbfd_steps {
   int evaluations;  // at most, of each world in each step, with all that is tried
   int worlds, first, last;
   int steps, held;
-  const void* given[9];
+  const void* given[10];
   const void* control;
-  void* found[9];
+  void* found[10];
   void* residual_norm;
   int* counted[4];
   int* fallbacks;

@@ -16,7 +16,7 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  return {{p->candidates, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
+  return {{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
 }
 
 template <template <class, class, int> class Scheme, class V, int D>
@@ -36,8 +36,8 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
   auto row = [](const void* array, long world, int count) { return static_cast<const T*>(array) + world * count; };
   const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   for (int w = s->first; w < s->last; w++)
-    inspect(plan, s->grip ? row(s->grip, w, p->candidates) : nullptr, row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq),
-            T(s->dt), Arena<T>{static_cast<T*>(room)}, static_cast<T*>(residual) + long(w) * p->nv,
+    inspect(plan, s->grip ? row(s->grip, w, p->candidates) : nullptr, p->anchors ? row(s->given[9], w, 3 * p->anchors) : nullptr,
+            row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt), Arena<T>{static_cast<T*>(room)}, static_cast<T*>(residual) + long(w) * p->nv,
             static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
 }
 

@@ -42,6 +42,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       : plan(scene), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
+    newton.balance.contacts.behind = before.behind;
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
   }
 
@@ -211,6 +212,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
     const M refused = scheme.advance(b, newton.q, before, after);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
+    if (plan.anchors > 0) b.contacts.remember(after.behind);
     M deep, far, kept(false), solved(false), failed(false), part(false), lost(false);
     look_for_hazards(deep, far);
     for (int i = 0; i < W; i++) {

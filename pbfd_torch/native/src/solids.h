@@ -169,10 +169,20 @@ template <class Solid> struct Placed {
       }
   }
 
+  template <class V, class N> static void to_world(const Candidates<N, 3>& c, int i, const V* x, V* out) {
+    turned(c.frame + 12 * c.solid[i], x, out);
+  }
+  template <class V, class N> static void to_own(const Candidates<N, 3>& c, int i, const V* x, V* out) {
+    turned_back(c.frame + 12 * c.solid[i], x, out);
+  }
+
  private:
   template <class V, class N> static void seen(const N* frame, const V* point, V* out) {
     const V off[3] = {point[0] - V(frame[9]), point[1] - V(frame[10]), point[2] - V(frame[11])};
-    for (int j = 0; j < 3; j++) out[j] = fma(V(frame[j]), off[0], fma(V(frame[3 + j]), off[1], V(frame[6 + j]) * off[2]));
+    turned_back(frame, off, out);
+  }
+  template <class V, class N> static void turned_back(const N* frame, const V* x, V* out) {
+    for (int j = 0; j < 3; j++) out[j] = fma(V(frame[j]), x[0], fma(V(frame[3 + j]), x[1], V(frame[6 + j]) * x[2]));
   }
   template <class V, class N> static void turned(const N* frame, const V* n, V* out) {
     for (int j = 0; j < 3; j++) out[j] = fma(V(frame[3 * j]), n[0], fma(V(frame[3 * j + 1]), n[1], V(frame[3 * j + 2]) * n[2]));

@@ -1,6 +1,7 @@
 // Solids at rest, as contact sees them: how far a point of the world is from them, which way, and how that way turns
 // (contact/surface.py). Each has
-//   beside: the distance and the direction at a point;   bend: how the direction turns there, ∂n/∂p [D × D], unless it is `flat`.
+//   beside: the distance and the direction at a point;   bend: how the direction turns there, ∂n/∂p [D × D], unless it is `flat`;
+//   to_world, to_own: a vector of its own frame in the world's, and back.
 // `exact`: φ is the distance itself. `convex`: it has an end, and what moves fast might pass through it.
 #pragma once
 #include "candidates.h"
@@ -22,6 +23,12 @@ struct Plane {
     out.distance = dot<D>(out.normal, point) - V(plane[D]), out.steepness = V(1);
   }
   template <class V, class N, int D> static void bend(const Candidates<N, D>&, int, const V*, const Beside<V, D>&, V*) {}
+  template <class V, class N> static void to_world(const Candidates<N, 3>&, int, const V* x, V* out) {
+    for (int j = 0; j < 3; j++) out[j] = x[j];
+  }
+  template <class V, class N> static void to_own(const Candidates<N, 3>&, int, const V* x, V* out) {
+    for (int j = 0; j < 3; j++) out[j] = x[j];
+  }
 };
 
 }  // namespace pbfd

@@ -1,5 +1,5 @@
 // The force of a candidate that touches, and how it answers (terms/touching.py): N n − G u at p = c + s, where u = (1 − nnᵀ) m is what
-// it slips over the step, m = c − c₀ + ϕ × s (METHOD §4), ϕ the rotation since its start.
+// it slips over the step, m = c − c₀ + ϕ × s + a (METHOD §4), ϕ the rotation since its start and a what an anchor is behind by.
 //
 // What moves is told by (ω, w), w the velocity of the centre: n answers with B w, s and h as supports.h says, the depth with
 // −δd = ‖∇φ‖ n·w − δh.
@@ -14,12 +14,12 @@
 namespace pbfd {
 
 template <class V, int D> struct Touching {
-  V center[D], moved[D];  // c, c − c₀
+  V center[D], moved[D];  // c, c − c₀ + a
   Beside<V, D> solid;
   V bend[D * D];
   Arm<V, D> arm;
   V depth, start;          // at the end of the step and at its beginning
-  V firmness, grip, per_range, per_width;  // C⊥, μ; 1 / (release speed and slip speed × Δt)
+  V firmness, grip, per_range, per_width;  // C⊥, μ; 1 / (release speed × Δt) and 1/ε
   V holding;                               // the normal force that friction feels, where it is lagged
   const Relaxed<V>* relaxed;
   const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
@@ -28,6 +28,12 @@ template <class V, int D> struct Touching {
   template <class Support> void travel(V* out) const {
     for (int j = 0; j < D; j++) out[j] = moved[j];
     if constexpr (Support::rolls) add_swing<D>(turn, arm.s, out);
+  }
+  // u
+  template <class Support> void slip(V* out) const {
+    travel<Support>(out);
+    const V lifted = dot<D>(out, solid.normal);
+    for (int j = 0; j < D; j++) out[j] = fma(-lifted, solid.normal[j], out[j]);
   }
 };
 
