@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import torch
@@ -17,14 +14,13 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.variational import Variational
+from pbfd_torch.native.calls import Calls, whole
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 
 COUNTED = ("status", "evaluations", "iterations", "hazards")
-ALIGNMENT = 64
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
-BLOCKS = 4  # for each thread: some worlds take longer than others
 
 
 @dataclass(frozen=True)
@@ -36,26 +32,18 @@ class Scheme:
     vectors: tuple[str, ...]
     numbers: tuple[str, ...] = ()
 
+    def fields(self, state: State) -> dict[str, Tensor]:
+        """Those of a state, in the order of the core, all worlds one after the other."""
+        batch = tuple(state.q.shape[:-1])
+        given = {name: whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in self.vectors}
+        return given | {name: whole(getattr(state, name), batch) for name in self.numbers}
+
 
 SCHEMES: dict[type, Scheme] = {
     EnergyMomentum: Scheme("pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
     ImplicitEuler: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
     Variational: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
 }
-
-
-class _Plan(ctypes.Structure):
-    _fields_ = (
-        *(
-            (name, ctypes.c_int)
-            for name in (
-                *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
-                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes"),
-            )
-        ),
-        ("whole", ctypes.c_void_p),
-        ("real", ctypes.c_void_p),
-    )
 
 
 class _Steps(ctypes.Structure):
@@ -98,12 +86,11 @@ class Journey:
     def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: tuple[int, ...], plan: Plan) -> None:
         batch = tuple(state.q.shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
-        self.given = {name: _whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in scheme.vectors}
-        self.given |= {name: _whole(getattr(state, name), batch) for name in scheme.numbers}
+        self.given = scheme.fields(state)
         if any(plan.anchors):
-            self.given["memory"] = _whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
-        self.control = _whole(control, (len(control), *batch, control.shape[-1]))
-        self.grip = None if plan.grip is None else _whole(plan.grip, (*batch, plan.grip.shape[-1]))
+            self.given["memory"] = whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
+        self.control = whole(control, (len(control), *batch, control.shape[-1]))
+        self.grip = None if plan.grip is None else whole(plan.grip, (*batch, plan.grip.shape[-1]))
         self.found = {name: _room_for(x, steps) for name, x in self.given.items()}
         self.residual_norm = state.q.new_empty((*steps, *batch))
         first, *others = COUNTED
@@ -136,61 +123,21 @@ class Journey:
         return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
 
 
-class _Room:
-    """Memory to work in, which begins where a register may lie."""
-
-    def __init__(self, size: int) -> None:
-        self._memory = torch.empty(size + ALIGNMENT, dtype=torch.uint8)
-        self.begin = ctypes.c_void_p(-(-self._memory.data_ptr() // ALIGNMENT) * ALIGNMENT)
-
-
 class Core:
     """A scene's plan and a scheme's steps in the compiled library. `threads`: at most, of those that share a call's worlds. Raises
     `ValueError` where library and plan do not fit together."""
 
     def __init__(self, library: Library, plan: Plan, scheme: Scheme, terms: Terms, threads: int) -> None:
-        self.plan, self._scheme, self._terms, self._threads = plan, scheme, terms, threads
-        self._functions = library.functions
-        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
-        wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
-        if wanted != (len(plan.whole), len(plan.real)):
-            raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")
-        self._size = self._asked("pbfd_room")
-        self._function, self._pointer = getattr(library.functions, scheme.function), ctypes.byref(self._plan)
-        self._rooms: list[_Room] = []  # that no call is in
-        self._lanes = library.lanes(plan.real.dtype)
-
-    def _asked(self, name: str) -> int:
-        return int(getattr(self._functions, name)(ctypes.byref(self._plan)))
+        self.plan, self._scheme, self._terms = plan, scheme, terms
+        self._calls = Calls(library, plan, threads)
 
     def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
         journey = Journey(self._scheme, state, control, steps, self.plan)
         asked = journey.call(self._terms)
-        blocks = min(BLOCKS * self._threads, asked.worlds * asked.steps // WORTH_A_BLOCK, asked.worlds // self._lanes)
-        if self._threads == 1 or blocks < 2:
-            self._make(asked)
-            return journey
-        calls = []
-        for first, last in _blocks(asked.worlds, blocks, self._lanes):
-            part = _Steps.from_buffer_copy(asked)
-            part.first, part.last = first, last
-            calls.append(part)
-        list(_pool(self._threads).map(self._make, calls))
+        self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
-
-    def _make(self, asked: _Steps) -> None:
-        room = self._room()
-        self._function(self._pointer, ctypes.byref(asked), room.begin)
-        self._rooms.append(room)
-
-    def _room(self) -> _Room:
-        """Memory for one call at a time."""
-        try:
-            return self._rooms.pop()
-        except IndexError:
-            return _Room(self._size)
 
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
         """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and
@@ -198,31 +145,12 @@ class Core:
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
         journey = Journey(self._scheme, state, held, (), self.plan)
-        at, residual, jacobian = _whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
+        at, residual, jacobian = whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
-        room = self._room()
-        self._functions.pbfd_balance(self._pointer, ctypes.byref(journey.call(self._terms)), *addresses, room.begin)
-        self._rooms.append(room)
+        self._calls.make("pbfd_balance", journey.call(self._terms), *addresses)
         return residual, jacobian
-
-
-def _whole(values: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """All numbers of a tensor that may be one for several worlds, one after the other."""
-    return values if values.shape == shape and values.is_contiguous() else values.expand(shape).contiguous()
 
 
 def _room_for(given: Tensor, steps: tuple[int, ...]) -> Tensor:
     """What a field `[*batch, ...]` becomes, `[*steps, *batch, ...]`."""
     return given.new_empty((*steps, *given.shape)) if steps else torch.empty_like(given)  # the quicker one
-
-
-def _blocks(worlds: int, count: int, lanes: int) -> list[tuple[int, int]]:
-    """Worlds from … to, in so many parts of whole registers."""
-    registers = -(-worlds // lanes)
-    bounds = [min(worlds, registers * i // count * lanes) for i in range(count + 1)]
-    return list(itertools.pairwise(bounds))
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "pbfd")

@@ -16,6 +16,7 @@ from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import Candidates, on_nodes
+from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import SHORTEST_STEP
@@ -37,28 +38,40 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 @dataclass(frozen=True, eq=False)
 class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
-    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ. anchors: how
-    many each contact has, in the order of a state's memory."""
+    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ. order: where
+    these are among those of all contact terms. anchors: how many each contact has, in the order of a state's memory."""
 
     sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
     dimension: int
     grip: Tensor | None
+    order: tuple[int, ...]
     anchors: tuple[int, ...]
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
-    """The plan of a stepper's scene. Raises `NotCompiledError` naming what the core does not know."""
+    """The plan of a stepper's scene, in a plane where it moves in one. Raises `NotCompiledError` naming what the core does not
+    know."""
     _require_covered(stepper)
     a = aligned(stepper.articulation)
     known = _Terms(stepper, a)
+    held = known.pushed or not known.candidates.flat
+    return _written(stepper, a, known, None if held else plane_of(a, [stepper.scene.gravity, *known.candidates.normals]))
+
+
+def planned_in_space(stepper: EagerStepper[Any]) -> Plan:
+    """The plan of a scene that the core knows, in space."""
+    a = aligned(stepper.articulation)
+    return _written(stepper, a, _Terms(stepper, a), None)
+
+
+def _written(stepper: EagerStepper[Any], a: Articulation, known: _Terms, plane: MotionPlane | None) -> Plan:
     t = a.topology
     kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in zip(t.joint_sizes, t.joint_is_hinge, strict=True)]
     whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
     act, candidates = known.actuators, known.candidates
     nodes, gravity = _nodes(a), stepper.scene.gravity
-    plane = None if known.pushed or not candidates.flat else plane_of(a, [gravity, *candidates.normals])
     if plane is not None:
         nodes, candidates, gravity = plane.nodes(a, nodes), candidates.within(plane), gravity @ plane.basis
     whole += _plain(nodes[0]) + _above(a)
@@ -83,10 +96,10 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
         *(x[k] for k in range(2) for x in known.pushes),
     ]
     flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
     dimension = 3 if plane is None else 2
+    sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
     whole_numbers = torch.tensor(whole, dtype=torch.int32)
-    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, tuple(candidates.anchors))
+    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, candidates.order, tuple(candidates.anchors))
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:

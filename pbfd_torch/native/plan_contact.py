@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import torch
@@ -51,6 +51,7 @@ class Candidates:
 
     Attributes:
         indices: node, solid, form and place among the anchors (−1: none) of each candidate of each kind.
+        places: of each, among the candidates of all terms, those that ride on the world too; `taken`: how many these are.
         rows: the numbers of some candidates of each kind, `[n, …]` each. grips: their μ, `[*batch, n]`.
         planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
             thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
@@ -58,6 +59,8 @@ class Candidates:
     """
 
     indices: list[list[tuple[int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    places: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
+    taken: int = 0
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
     grips: list[list[Tensor]] = field(default_factory=lambda: [[] for _ in KINDS])
     planes: list[Tensor] = field(default_factory=list)
@@ -75,6 +78,11 @@ class Candidates:
         return sum(map(len, self.indices)), sum(self.anchors), len(self.planes), len(self.solids), samples, forms
 
     @property
+    def order(self) -> tuple[int, ...]:
+        """The places of all candidates, sorted."""
+        return tuple(chain(*self.places))
+
+    @property
     def normals(self) -> list[Tensor]:
         """Of all half-spaces."""
         return [x[:3] for x in self.planes]
@@ -90,7 +98,7 @@ class Candidates:
         for indices, row in zip(self.indices, self.rows, strict=True):
             rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, *_), x in zip(indices, row, strict=True)])
         planes = [torch.cat((x[:3] @ plane.basis, x[3:])) for x in self.planes]
-        return Candidates(self.indices[:PLANAR], rows, self.grips, planes, anchors=self.anchors)
+        return replace(self, indices=self.indices[:PLANAR], rows=rows, planes=planes)
 
     def whole(self) -> list[int]:
         """The index tables."""
@@ -145,6 +153,8 @@ class Candidates:
         )
         anchor = sum(self.anchors)
         self.anchors.append(len(nodes) if anchored else 0)
+        before = self.taken
+        self.taken += len(nodes)
         if len(moving) == 0:
             return
         solid, first = self._solid(a, term, name), self.sizes[-1]
@@ -160,6 +170,7 @@ class Candidates:
                 support, form = (POINT if flat else BALL), 0
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
+            self.places[kind].append(before + i)
             self.rows[kind].append([x[i, None] for x in numbers])
             self.grips[kind].append(grip[..., i, None])
 

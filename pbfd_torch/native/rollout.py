@@ -1,15 +1,13 @@
-"""Rollouts by the compiled core: many steps in one call, and their record in one go."""
+"""Rollouts by the compiled core: many steps in one call, and their record in another."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.stepper import NativeStepper, spread
-from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.solvers.per_world import mapped
 
@@ -26,26 +24,24 @@ def rolled_out(
     """See `Simulator.rollout`. Progress is told of each step when a few of them are done."""
     count = stepper.scene.step_count(controls, steps)
     state = stepper.complete(state)
-    recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, state)
+    record = stepper.record(state, count)
     batch = state.q.shape[:-1]
     most = max(1, AT_ONCE // max(1, state.q[..., 0].numel()))
     try:
-        while recorder.steps < count:
-            first = recorder.steps
+        while record.steps < count:
+            first = record.steps
             part = min(most, count - first)
             held = None if controls is None else spread(controls[first : first + part], batch)
             states, solution = stepper.run(state, held, part)
             told = _told(progress, first, part)
-            before = mapped(_shifted, state, states)
-            states, solution, before = (mapped(lambda x, kept=told: x[:kept], whole) for whole in (states, solution, before))
-            recorder.record_several(states, solution, stepper.objective(before, None if held is None else held[:told]))
+            record.add(state, *(mapped(lambda x, kept=told: x[:kept], whole) for whole in (states, solution)))
             if told < part:
                 break
             state = mapped(_last, states)
     except KeyboardInterrupt:
-        if recorder.steps == 0:
+        if record.steps == 0:
             raise
-    return recorder.finish()
+    return record.finish()
 
 
 def _told(progress: Callable[[int], object] | None, first: int, part: int) -> int:
@@ -58,11 +54,6 @@ def _told(progress: Callable[[int], object] | None, first: int, part: int) -> in
         except KeyboardInterrupt:
             return k + 1
     return part
-
-
-def _shifted(start: Tensor, ends: Tensor) -> Tensor:
-    """The states that steps set out from, of the first one and of those after each."""
-    return torch.cat((start[None], ends[:-1]))
 
 
 def _last(ends: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Generic
 
 import torch
@@ -19,6 +20,7 @@ from pbfd_torch.native.core import SCHEMES, Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError
 from pbfd_torch.native.plan import Plan, planned
+from pbfd_torch.native.recording import Record, Writer
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
@@ -117,6 +119,16 @@ class NativeStepper(Generic[S]):
         if not isinstance(state, Positions) or state.acceleration is not None:
             return state
         return replaced(state, acceleration=state.q.new_zeros(*batch, self.scene.articulation.nv))
+
+    def record(self, state: S, steps: int) -> Record[S]:
+        """An empty record from a state on, with room for so many steps."""
+        return Record(self._writer, self.complete(state), steps)
+
+    @cached_property
+    def _writer(self) -> Writer[S]:
+        compiled = library()
+        assert compiled is not None
+        return Writer(compiled, self.eager, self._core.plan, self.threads)
 
     def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
         """See `Stepper`."""

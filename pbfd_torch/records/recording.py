@@ -14,7 +14,6 @@ from pbfd_torch.records.depiction import depicted
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.load import Hazardous
@@ -36,11 +35,7 @@ class Records:
             self._entries[name] = [value[None]]
 
     def _add(self, solution: Solution, entries: dict[str, Tensor]) -> None:
-        """One step."""
-        self._add_several(mapped(_one, solution), {name: value[None] for name, value in entries.items()})
-
-    def _add_several(self, solution: Solution, entries: dict[str, Tensor]) -> None:
-        """Steps `[steps, *batch, ...]`, all at once: an interruption before this leaves the record as it was."""
+        """One step: an interruption before this leaves the record as it was."""
         solved = {
             "status": solution.status,
             "iterations": solution.iterations,
@@ -50,8 +45,8 @@ class Records:
             "substeps": torch.ones_like(solution.status) if solution.steps is None else solution.steps,
         }
         for name, value in (entries | solved).items():
-            self._entries.setdefault(name, []).append(value)
-        self.steps += len(solution.status)
+            self._entries.setdefault(name, []).append(value[None])
+        self.steps += 1
         self._lanes += solution.lanes
 
     def _seen(self, placement: Placement, v: Tensor, rates: Tensor, stored: Tensor) -> dict[str, Tensor]:
@@ -72,36 +67,44 @@ class Records:
     def finish(self, lanes: int | None = None) -> Rollout:
         """The record so far; lanes: what the schedule spent, where the steps themselves do not know it."""
         stacked = {name: torch.cat(_alike(values)) for name, values in self._entries.items()}
-        like, a = stacked["q"], self._scene.articulation
         if "contact_depth" not in stacked:
+            like = stacked["q"]
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
             stacked |= dict.fromkeys(_CONTACT, empty[..., None].expand(*empty.shape, 3)) | {"contact_depth": empty}
-        time = self._dt * torch.arange(self.steps + 1, dtype=like.dtype, device=like.device)
-        return Rollout(
-            scene_name=self._scene.name,
-            dt=self._dt,
-            link_names=self._scene.articulation.link_names,
-            joint_names=self._scene.articulation.joint_names,
-            dangers=tuple(x for term in self._scene.terms if isinstance(term, Hazardous) for x in term.dangers(a)),
-            lanes=torch.tensor(self._lanes if lanes is None else lanes),
-            appearance=depicted(self._scene),
-            time=time,
-            obstacle_poses=self._obstacle_poses(time, like.shape[1:-1]),
-            **stacked,
-        )
+        spent = self._lanes if lanes is None else lanes
+        return assembled(self._scene, self._dt, spent, stacked)
 
-    def _obstacle_poses(self, time: Tensor, batch: torch.Size) -> Tensor:
-        """See `Rollout`."""
-        a, obstacles = self._scene.articulation, self._scene.obstacles
-        moves = any(x.motion.moves for x in obstacles)
-        shape = (len(time) if moves else 1, *batch)
-        when = (time if moves else time[:1]).reshape(-1, *(1 for _ in batch)).expand(shape)
-        poses = [time.new_zeros((*shape, 0, 3, 4))]
-        for obstacle in obstacles:
-            carrier = obstacle.carrier(a.dtype, a.device)
-            pose = torch.eye(4, dtype=a.dtype, device=a.device) if carrier is None else carrier.pose(when)
-            poses.append(pose[..., None, :3, :].expand(*shape, 1, 3, 4))
-        return torch.cat(poses, -3)
+
+def assembled(scene: Scene, dt: float, lanes: int, arrays: dict[str, Tensor]) -> Rollout:
+    """The rollout of all that is recorded at each step; the rest is the scene's."""
+    like, a = arrays["q"], scene.articulation
+    time = dt * torch.arange(len(like), dtype=like.dtype, device=like.device)
+    return Rollout(
+        scene_name=scene.name,
+        dt=dt,
+        link_names=a.link_names,
+        joint_names=a.joint_names,
+        dangers=tuple(x for term in scene.terms if isinstance(term, Hazardous) for x in term.dangers(a)),
+        lanes=torch.tensor(lanes),
+        appearance=depicted(scene),
+        time=time,
+        obstacle_poses=_obstacle_poses(scene, time, like.shape[1:-1]),
+        **arrays,
+    )
+
+
+def _obstacle_poses(scene: Scene, time: Tensor, batch: torch.Size) -> Tensor:
+    """See `Rollout`."""
+    a, obstacles = scene.articulation, scene.obstacles
+    moves = any(x.motion.moves for x in obstacles)
+    shape = (len(time) if moves else 1, *batch)
+    when = (time if moves else time[:1]).reshape(-1, *(1 for _ in batch)).expand(shape)
+    poses = [time.new_zeros((*shape, 0, 3, 4))]
+    for obstacle in obstacles:
+        carrier = obstacle.carrier(a.dtype, a.device)
+        pose = torch.eye(4, dtype=a.dtype, device=a.device) if carrier is None else carrier.pose(when)
+        poses.append(pose[..., None, :3, :].expand(*shape, 1, 3, 4))
+    return torch.cat(poses, -3)
 
 
 def least_bytes(scene: Scene, worlds: int, steps: int) -> int:
@@ -131,10 +134,6 @@ class Recorder(Records):
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:
         """One solved step: the state after it, how it was solved, and its contacts."""
         self._add(solution, self._step(state, objective))
-
-    def record_several(self, states: State, solution: Solution, objective: BalanceObjective) -> None:
-        """Several solved steps, each value `[steps, *batch, ...]`; the balance is that of all of them."""
-        self._add_several(solution, self._step(states, objective))
 
     def _step(self, state: State, objective: BalanceObjective) -> dict[str, Tensor]:
         placement = place(self._scene.articulation, state.q)
@@ -172,11 +171,6 @@ def _alike(values: list[Tensor]) -> list[Tensor]:
     """The same values, those of contacts with as many slots as the step with the most of them: the number may grow."""
     most = [max(sizes) for sizes in zip(*(x.shape[1:] for x in values), strict=True)]
     return [_padded(x, [len(x), *most]) for x in values]
-
-
-def _one(value: Tensor) -> Tensor:
-    """A step as the only one."""
-    return value[None]
 
 
 def _padded(value: Tensor, shape: list[int]) -> Tensor:

@@ -101,16 +101,20 @@ template <class V, class N, int D> struct Contacts {
   void look_for_hazards(M& deep, M& far) const {
     each_kind(candidates, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) {
-        const int at = D * D * candidates.carrier[i];
-        const V *R = now.rotation + at, *R0 = before.rotation + at;
-        V c[D], traced(0);
+        V c[D];
         Beside<V, D> solid;
         center(i, now, c);
         const V d = depth(pair, i, now, c, solid);
-        for (int j = 0; j < D * D; j++) traced = fma(R[j], R0[j], traced);
-        deep = deep | (d > V(candidates.deep[i])), far = far | ((d > V(0)) & (traced < V(D - 2)));
+        deep = deep | (d > V(candidates.deep[i])), far = far | ((d > V(0)) & turned_far(i));
       }
     });
+  }
+  // Whose body has turned by more than a quarter turn in the step.
+  M turned_far(int i) const {
+    const V *R = now.rotation + D * D * candidates.carrier[i], *R0 = before.rotation + D * D * candidates.carrier[i];
+    V traced(0);
+    for (int j = 0; j < D * D; j++) traced = fma(R[j], R0[j], traced);
+    return traced < V(D - 2);
   }
 
   // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
@@ -144,8 +148,24 @@ template <class V, class N, int D> struct Contacts {
       solid.distance = select(stands, dot<D>(plane + 1, c) - plane[1 + D], solid.distance);
       for (int j = 0; j < D; j++) solid.normal[j] = select(stands, plane[1 + j], solid.normal[j]);
     }
+    return sunk(Pair(), i, at, solid);
+  }
+  // How deep it is beside what is known of a solid.
+  template <class Pair> V sunk(Pair, int i, Poses<V> at, const Beside<V, D>& solid) const {
     const V reach = Pair::Support::reach(candidates, i, at.rotation + D * D * candidates.carrier[i], solid.normal);
     return reach + V(candidates.margin[i]) - solid.distance;
+  }
+
+  // What its normal force stores where the nodes are: C d³/3 (Eq. 9), of the solid itself.
+  template <class Pair> V stored(Pair, int i) const {
+    V c[D], firmness = V(candidates.firmness[i]);
+    Beside<V, D> solid;
+    center(i, now, c);
+    Pair::Surface::beside(candidates, i, c, solid);
+    if constexpr (Pair::Support::wanders)
+      firmness = firmness * Pair::Support::share(candidates, i, now.rotation + D * D * candidates.carrier[i], solid.normal);
+    const V d = max(sunk(Pair(), i, now, solid), V(0));
+    return V(N(1) / N(3)) * firmness * d * d * d;
   }
 
   // The rest of what is to be known of a candidate whose centre and depth are.

@@ -49,6 +49,11 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     for (int i = 0; i < plan.nv; i++) out[i] = fma(V(0.5), x.steady[i] + x.lag[i], x.v[i]);
   }
 
+  // How fast poses change at t_n, where the nodes are and the velocity is known.
+  void speeds(const State&, Poses<V> now, const V* axes, const V* velocity, V, V* out) {
+    pose_rates(plan, now, axes, velocity, twist, out);
+  }
+
   // What is fixed in the step from a state, and where it may end.
   void begin(Balance<V, N, D>& b, const State& before, V* guess) {
     begin_energy_momentum(b, before.q, before.v, room_to_begin);

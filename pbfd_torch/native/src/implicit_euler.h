@@ -47,6 +47,15 @@ template <class V, class N, int D> struct ImplicitEuler {
     for (int i = 0; i < plan.nv; i++) out[i] = out[i] / dt;
   }
 
+  // How fast poses have changed over that step, where the nodes are now.
+  void speeds(const State& x, Poses<V> now, const V*, const V*, V dt, V* out) {
+    place(plan, x.q_previous, earlier, axes);
+    for (int k = 0; k < plan.nodes; k++, out += D * D + D) {
+      for (int i = 0; i < D * D; i++) out[i] = (now.rotation[D * D * k + i] - earlier.rotation[D * D * k + i]) / dt;
+      for (int i = 0; i < D; i++) out[D * D + i] = (now.position[D * k + i] - earlier.position[D * k + i]) / dt;
+    }
+  }
+
   // What is fixed in the step from a state, and where it may end.
   void begin(Balance<V, N, D>& b, const State& before, V* guess) {
     for (int i = 0; i < plan.nq; i++) b.q_start[i] = before.q[i];

@@ -50,6 +50,39 @@ PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
 
+// What a record lists beside what a plan in space knows.
+//   carrier: node of each link, −1: it rides on the world; frame: [links, 12] rotation and position, row by row, of the links there;
+//   slot: the place of each of the plan's candidates among all `slots` of a row of contacts; danger: its number among the dangers;
+//   first_limit: that of the first dof's limit, −1: there are none; mass: [1] of all links;
+//   of what rides on the world: still_moment [3], Σ m x; still_energy [1]; still_strain [1] and still_suspect, of the candidate there
+//   that is deepest beyond its measure and its number, −∞: there is none.
+struct pbfd_roster {
+  int links, slots, first_limit, still_suspect;
+  const int *carrier, *slot, *danger;
+  const void *frame, *mass, *still_moment, *still_energy, *still_strain;
+};
+
+// The record of steps `first` … `last` − 1 of all steps of all worlds that have been made, where world w makes its steps w,
+// worlds + w, 2 worlds + w …: `given` and `found` as in pbfd_steps, where only what they hold is read; hazards: of each step;
+//   q, v, link_poses [links, 12], center_of_mass [3], kinetic_energy, potential_energy, linear_momentum [3], angular_momentum [3]:
+//     of the state after each step, [steps, …];
+//   contact_depth [slots], contact_point, contact_normal, contact_force, contact_slip [slots, 3], suspect: of each step, [steps, …];
+//     if suspect is null nothing of these is asked for, and what is `given` does not count.
+struct pbfd_record {
+  double dt;
+  int worlds, first, last;
+  const void* given[9];
+  const void* found[9];
+  const int* hazards;
+  const void* grip;
+  void *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;
+  void *contact_depth, *contact_point, *contact_normal, *contact_force, *contact_slip;
+  int* suspect;
+};
+
+PBFD_FUNCTION void pbfd_energy_momentum_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);
+PBFD_FUNCTION void pbfd_implicit_euler_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);
+
 // The balance of forces that energy–momentum steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
 // J [worlds, nv · nv].
 PBFD_FUNCTION void pbfd_balance(const pbfd_plan*, const pbfd_steps*, const void* q, void* residual, void* jacobian, void* room);

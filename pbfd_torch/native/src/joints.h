@@ -7,6 +7,8 @@
 
 namespace pbfd {
 
+constexpr double TOO_FAR = 0.02;  // [rad or m] past a limit: a hazard
+
 // What is fixed in a step.
 template <class V> struct JointStep {
   const V* start;   // [nq] θ_n
@@ -27,6 +29,16 @@ template <class V, class N, int D> inline void stiffen_limits(const Plan<N, D>& 
     out[plan.actuated_v[a]] += gear * clamped(drive, V(plan.least_force[a]), V(plan.most_force[a]));
   }
   for (int i = 0; i < plan.nv; i++) out[i] = max(V(plan.limit[i]), V(plan.limit_per_force[0]) * abs(out[i]));
+}
+
+// How far each hinge and slide is past its limits, < 0 within them: visit(dof, past).
+template <class V, class N, int D, class F> inline void each_limit(const Plan<N, D>& plan, const V* q, F&& visit) {
+  for (int k = 0; k < plan.nodes; k++) {
+    if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
+    const int i = plan.v[k];
+    const V x = q[plan.q[k]];
+    visit(i, max(V(plan.lower[i]) - x, x - V(plan.upper[i])));
+  }
 }
 
 // Springs, damping, actuators; dry friction; limits; both; armatures.

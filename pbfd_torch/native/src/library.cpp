@@ -3,7 +3,10 @@
 
 #include "inspection.h"
 #include "machine.h"
+#include "record.h"
 #include "target.h"
+
+#include <algorithm>
 
 using namespace pbfd;
 
@@ -57,11 +60,36 @@ template <template <class, class, int> class Scheme> void make_by(const pbfd_pla
     plane ? make_of<Scheme, float, 2>(p, s, room) : make_of<Scheme, float, 3>(p, s, room);
 }
 
+template <template <class, class, int> class Scheme, class T>
+void record_of(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
+  using V = Lanes<T, register_bytes / int(sizeof(T))>;
+  auto real = [](const void* array) { return static_cast<const T*>(array); };
+  auto out = [](void* array) { return static_cast<T*>(array); };
+  Arena<V> arena{static_cast<V*>(room)};
+  const Plan<T, 3> plan(sizes(p), p->whole, real(p->real));
+  const Roster<T> roster{r->links, r->slots, r->first_limit, r->still_suspect, r->carrier, r->slot, r->danger, real(r->frame),
+                         real(r->mass), real(r->still_moment), real(r->still_energy), real(r->still_strain)};
+  const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, out(a->q), out(a->v), out(a->link_poses),
+                         out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
+                         out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
+                         out(a->contact_force), out(a->contact_slip), a->suspect};
+  Recorder<V, T, Scheme<V, T, 3>> recorder(plan, roster, arena);
+  recorder.balance.contacts.own_grip = real(a->grip);
+  recorder.write(record, a->first, a->last);
+}
+
+template <template <class, class, int> class Scheme>
+void record_by(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
+  (p->bytes == 8 ? record_of<Scheme, double> : record_of<Scheme, float>)(p, r, a, room);
+}
+
 // Room for lanes V, in V; a plane needs less.
 template <class V> int room_of(Sizes s) {
   using T = typename Kind<V>::Scalar;
-  const int one = Machine<V, T, 3, EnergyMomentum<V, T, 3>>::room(s), other = Machine<V, T, 3, ImplicitEuler<V, T, 3>>::room(s);
-  return one > other ? one : other;
+  using One = EnergyMomentum<V, T, 3>;
+  using Other = ImplicitEuler<V, T, 3>;
+  return std::max({Machine<V, T, 3, One>::room(s), Machine<V, T, 3, Other>::room(s), Recorder<V, T, One>::room(s),
+                   Recorder<V, T, Other>::room(s)});
 }
 
 }  // namespace
@@ -85,6 +113,14 @@ long pbfd_room(const pbfd_plan* p) {
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<EnergyMomentum>(p, s, room); }
 
 void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<ImplicitEuler>(p, s, room); }
+
+void pbfd_energy_momentum_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
+  record_by<EnergyMomentum>(p, r, a, room);
+}
+
+void pbfd_implicit_euler_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
+  record_by<ImplicitEuler>(p, r, a, room);
+}
 
 void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   const bool plane = p->dimension == 2;

@@ -9,7 +9,6 @@
 namespace pbfd {
 
 constexpr int TOO_DEEP = 8, TURNED_FAR = 16;
-constexpr double TOO_FAR = 0.02;  // [rad or m] past a limit
 
 // What one call is asked for: arrays as interface.h has them.
 template <class T> struct Journey {
@@ -277,12 +276,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void look_for_hazards(M& deep, M& far) const {
     deep = far = M(false);
     newton.balance.contacts.look_for_hazards(deep, far);
-    for (int k = 0; k < plan.nodes; k++) {
-      if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
-      const int i = plan.v[k];
-      const V x = newton.q[plan.q[k]], past = max(V(plan.lower[i]) - x, x - V(plan.upper[i]));
-      deep = deep | ((past > V(TOO_FAR)) & (V(plan.limit[i]) > V(0)));
-    }
+    each_limit(plan, newton.q, [&](int i, V past) { deep = deep | ((past > V(TOO_FAR)) & (V(plan.limit[i]) > V(0))); });
   }
 
   // Between a lane and the arrays.

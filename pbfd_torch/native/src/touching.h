@@ -37,21 +37,32 @@ template <class V, int D> struct Touching {
   }
 };
 
+// m and its part along n, u, p and f; N of the depth, what friction feels of it, and how both rise; the drag G and what it is made of.
+template <class V, int D> struct Force {
+  V m[D], lifted, u[D], p[D], f[D], push, rises, pressed, firmer, factor, falls, drag;
+};
+
+template <class Support, class V, int D> inline void force(const Touching<V, D>& t, Force<V, D>& out) {
+  const V *n = t.solid.normal, *s = t.arm.s, *c = t.center;
+  t.template travel<Support>(out.m);
+  out.lifted = dot<D>(out.m, n);
+  for (int j = 0; j < D; j++) out.u[j] = fma(-out.lifted, n[j], out.m[j]), out.p[j] = Support::rolls ? c[j] + s[j] : c[j];
+  release_law(t.firmness, t.depth, t.start, t.per_range, out.push, out.rises);
+  slip_law(sqrt(dot<D>(out.u, out.u)), t.per_width, out.factor, out.falls);
+  out.pressed = out.push, out.firmer = out.rises;
+  t.relaxed->felt(t.holding, out.pressed, out.firmer);
+  out.drag = t.grip * out.pressed * out.factor;
+  for (int j = 0; j < D; j++) out.f[j] = fma(out.push, n[j], -(out.drag * out.u[j]));
+}
+
 // `FLAT`: the normal does not turn, and the depth is the distance itself.
 template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press(const Touching<V, D>& t, Push<V, D>& out) {
   constexpr int T = turns(D), S = T + D;
   const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
-  V m[D], u[D], p[D], f[D];
-  t.template travel<Support>(m);
-  const V lifted = dot<D>(m, n);
-  for (int j = 0; j < D; j++) u[j] = fma(-lifted, n[j], m[j]), p[j] = Support::rolls ? c[j] + s[j] : c[j];
-  V push, rises, factor, falls;
-  release_law(t.firmness, t.depth, t.start, t.per_range, push, rises);
-  slip_law(sqrt(dot<D>(u, u)), t.per_width, factor, falls);
-  V pressed = push, firmer = rises;
-  t.relaxed->felt(t.holding, pressed, firmer);
-  const V drag = t.grip * pressed * factor, by_depth = t.grip * firmer * factor, by_size = t.grip * pressed * falls;
-  for (int j = 0; j < D; j++) f[j] = fma(push, n[j], -(drag * u[j]));
+  Force<V, D> at;
+  force<Support>(t, at);
+  const V *m = at.m, *u = at.u, *p = at.p, *f = at.f, lifted = at.lifted, push = at.push, rises = at.rises, drag = at.drag;
+  const V by_depth = t.grip * at.firmer * at.factor, by_size = t.grip * at.pressed * at.falls;
 
   // answers: −δf of a motion that makes the slip grow by `slips` and the depth fall by `sinks`, but for what the normal's turn does
   auto answer = [&](const V* slips, V sinks, V* a) {

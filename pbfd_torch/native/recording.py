@@ -1,0 +1,123 @@
+"""Records of rollouts, written by the compiled core into a rollout's own arrays."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from typing import Any, Generic
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.integrators.integrator import S
+from pbfd_torch.native.calls import Calls, whole
+from pbfd_torch.native.core import SCHEMES
+from pbfd_torch.native.library import Library
+from pbfd_torch.native.plan import Plan, planned_in_space
+from pbfd_torch.native.roster import CONTACT, rostered
+from pbfd_torch.records.recording import assembled
+from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.scene import Scene
+from pbfd_torch.solvers.objective import FALLBACKS, Solution
+from pbfd_torch.stepping.eager import EagerStepper
+
+WORTH_A_BLOCK = 1024  # steps of worlds: fewer are recorded about as soon as another thread has begun
+_STATE = ("q", "v", "link_poses", "center_of_mass", "kinetic_energy", "potential_energy", "linear_momentum", "angular_momentum")
+_SOLUTION = ("status", "iterations", "evaluations", "residual_norm", "fallbacks")
+
+
+class _Roster(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("links", "slots", "first_limit", "still_suspect")),
+        *((name, ctypes.c_void_p) for name in ("carrier", "slot", "danger", "frame", "mass")),
+        *((name, ctypes.c_void_p) for name in ("still_moment", "still_energy", "still_strain")),
+    )
+
+
+class _Record(ctypes.Structure):
+    _fields_ = (
+        ("dt", ctypes.c_double),
+        *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
+        ("given", ctypes.c_void_p * 9),
+        ("found", ctypes.c_void_p * 9),
+        *((name, ctypes.c_void_p) for name in ("hazards", "grip", *_STATE, *CONTACT, "suspect")),
+    )
+
+
+class Writer(Generic[S]):
+    """Writes what a record has of the steps of a stepper. `plan`: the steps'; `threads`: at most."""
+
+    def __init__(self, library: Library, eager: EagerStepper[S], plan: Plan, threads: int) -> None:
+        self.scene, self.dt = eager.scene, eager.dt
+        space = plan if plan.dimension == 3 else planned_in_space(eager)
+        self.roster = rostered(eager, space)
+        self._scheme = SCHEMES[type(eager.integrator)]
+        self._calls, self._grip = Calls(library, space, threads), space.grip
+        r = self.roster
+        self._roster = _Roster(len(r.carrier), r.slots, r.first_limit, r.still_suspect)
+        for name in ("carrier", "slot", "danger", "frame", "mass", "still_moment", "still_energy", "still_strain"):
+            setattr(self._roster, name, getattr(r, name).data_ptr())
+
+    def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
+        """Of steps from the state before the first to those after each `[steps, *batch, …]`, in arrays of this length: the state
+        after each, and its contacts if there is a `suspect`; `hazards` are there already."""
+        given, found = self._scheme.fields(before), self._scheme.fields(states)
+        batch = tuple(before.q.shape[:-1])
+        worlds, steps = math.prod(batch), math.prod(states.q.shape[:-1])
+        asked = _Record(self.dt, worlds, 0, steps)
+        for i, (start, end) in enumerate(zip(given.values(), found.values(), strict=True)):
+            asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
+        for name, array in arrays.items():
+            setattr(asked, name, array.data_ptr())
+        grip = None if self._grip is None else whole(self._grip, (*batch, self._grip.shape[-1]))
+        if grip is not None:
+            asked.grip = grip.data_ptr()
+        self._calls.share(f"{self._scheme.function}_record", asked, steps, steps // WORTH_A_BLOCK, self._roster)
+
+
+class Record(Generic[S]):
+    """The arrays of a rollout, with room for so many steps from a state. `steps`: those that are in it."""
+
+    def __init__(self, writer: Writer[S], state: S, room: int) -> None:
+        self._writer, self.steps, self._lanes = writer, 0, 0
+        batch = state.q.shape[:-1]
+        like, roster = state.q, writer.roster
+        count = torch.empty(0, dtype=torch.int32)
+        self._states = {name: like.new_empty(room + 1, *batch, *event) for name, event in _state_events(writer.scene).items()}
+        self._contacts = {name: like.new_empty(room, *batch, roster.slots, *event) for name, event in CONTACT.items()}
+        self._counts = {name: count.new_empty(room, *batch) for name in ("suspect", "hazards")}
+        events: dict[str, tuple[int, ...]] = dict.fromkeys(_SOLUTION, ()) | {"fallbacks": (len(FALLBACKS),)}
+        self._solution = {
+            name: (like if name == "residual_norm" else count).new_empty(room, *batch, *event) for name, event in events.items()
+        }
+        slots, still = roster.still
+        for name, values in still.items():
+            self._contacts[name].flatten(0, len(batch))[:, slots] = values
+        writer.write(state, state, {name: x[:1] for name, x in self._states.items()})
+
+    def add(self, before: S, states: S, solution: Solution) -> None:
+        """Steps from the state before the first to those after each, `[steps, *batch, …]`. An interruption before the end leaves
+        the record as it was."""
+        first, last = self.steps, self.steps + len(solution.status)
+        self._counts["hazards"][first:last] = states.hazards
+        for name in _SOLUTION:
+            self._solution[name][first:last] = getattr(solution, name)
+        arrays = {name: x[first + 1 : last + 1] for name, x in self._states.items()}
+        arrays |= {name: x[first:last] for name, x in (self._contacts | self._counts).items()}
+        self._writer.write(before, states, arrays)
+        self.steps, self._lanes = last, self._lanes + solution.lanes
+
+    def finish(self) -> Rollout:
+        """The record so far."""
+        arrays = {name: x[: self.steps + 1] for name, x in self._states.items()}
+        arrays |= {name: x[: self.steps] for name, x in (self._contacts | self._counts | self._solution).items()}
+        arrays["substeps"] = torch.ones_like(arrays["status"])
+        return assembled(self._writer.scene, self._writer.dt, self._lanes, arrays)
+
+
+def _state_events(scene: Scene) -> dict[str, Any]:
+    """What the record has of one state, by the shapes."""
+    a = scene.articulation
+    sizes: dict[str, tuple[int, ...]] = {"q": (a.nq,), "v": (a.nv,), "link_poses": (a.nlink, 3, 4)}
+    sizes |= dict.fromkeys(("center_of_mass", "linear_momentum", "angular_momentum"), (3,))
+    return {name: sizes.get(name, ()) for name in _STATE}

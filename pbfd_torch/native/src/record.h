@@ -1,0 +1,194 @@
+// The record of steps that have been made, as records/recording.py: what is seen of the state after each, and of its contacts. A step
+// is known by the states before and after it, so a register may hold several of one world. It is made in space, whatever the steps.
+#pragma once
+#include "energy_momentum.h"
+#include "implicit_euler.h"
+
+namespace pbfd {
+
+// What a record is asked for: arrays as interface.h has them.
+template <class T> struct Record {
+  T dt;
+  int worlds;
+  const void *const *given, *const *found;
+  const int* hazards;
+  T *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;
+  T *depth, *point, *normal, *force, *slip;
+  int* suspect;
+};
+
+// The links, the slots of contacts and the dangers that a record lists, and what rides on the world: arrays as interface.h has them.
+template <class N> struct Roster {
+  int links, slots, first_limit, still_suspect;
+  const int *carrier, *slot, *danger;
+  const N *frame, *mass, *still_moment, *still_energy, *still_strain;
+};
+
+template <class V, class N, class Scheme> struct Recorder {
+  using T = typename Kind<V>::Scalar;
+  using M = typename Kind<V>::Mask;
+  using State = typename Scheme::State;
+  static constexpr int W = Kind<V>::lanes, D = 3;
+
+  const Plan<N, D>& plan;
+  const Roster<N>& roster;
+  Balance<V, N, D> balance;
+  Scheme scheme;
+  State before, after;
+  V *velocity, *rates, *rest, *gap, *guess;
+
+  static int room(Sizes s) {
+    return Balance<V, N, D>::room(s) + Scheme::room(s) + 2 * room_for<State>(s) + 12 * s.nodes + 2 * s.nv + 2 * s.nq;
+  }
+  Recorder(const Plan<N, D>& scene, const Roster<N>& listed, Arena<V>& arena)
+      : plan(scene), roster(listed), balance(plan, arena), scheme(plan, arena) {
+    before = taken<State>(arena, plan), after = taken<State>(arena, plan);
+    velocity = arena.take(plan.nv), rates = arena.take(12 * plan.nodes), gap = arena.take(plan.nv);
+    rest = arena.take(plan.nq), guess = arena.take(plan.nq);
+    for (int i = 0; i < plan.nq; i++) rest[i] = V(plan.rest[i]);
+  }
+
+  // Of steps first … last − 1 of all steps of all worlds.
+  void write(const Record<T>& to, int first, int last) {
+    record = &to;
+    balance.dt = V(to.dt);
+    for (at = first; at < last; at += W) {
+      count = last - at < W ? last - at : W;
+      for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));
+      place(plan, after.q, balance.now, balance.axes);
+      balance.contacts.look(balance.now);
+      write_state();
+      if (record->suspect) write_step();
+    }
+  }
+
+ private:
+  const Record<T>* record;
+  int at, count;  // which steps the lanes hold
+
+  // Between a lane and the arrays.
+  void load(int i, int step) {
+    balance.contacts.load(i, step % record->worlds);
+    const bool begins = step < record->worlds;
+    const long earlier = begins ? step : step - record->worlds;
+    int k = 0;
+    State::each(plan, [&](auto member, int width) {
+      const T* end = static_cast<const T*>(record->found[k]) + long(step) * width;
+      const T* start = static_cast<const T*>(begins ? record->given[k] : record->found[k]) + earlier * width;
+      for (int j = 0; j < width; j++) put((after.*member)[j], i, end[j]), put((before.*member)[j], i, start[j]);
+      k++;
+    });
+  }
+  // values [width], at a place in each step's row.
+  void store(T* array, const V* values, int width, int row, int place = 0) const {
+    for (int i = 0; i < count; i++) {
+      T* to = array + long(at + i) * row + place;
+      for (int j = 0; j < width; j++) to[j] = lane(values[j], i);
+    }
+  }
+
+  void write_state() {
+    scheme.velocity(after, balance.dt, velocity);
+    scheme.speeds(after, balance.now, balance.axes, velocity, balance.dt, rates);
+    V center[D], linear[D], angular[D], levered[D], rotors(0);
+    sum_up(center, linear, angular);
+    const V potential = stored(center), per_mass = V(N(1) / roster.mass[0]);
+    for (int i = 0; i < D; i++) center[i] = per_mass * (center[i] + V(roster.still_moment[i]));
+    cross(center, linear, levered);
+    for (int i = 0; i < D; i++) angular[i] = angular[i] - levered[i];
+    for (int i = 0; i < plan.nv; i++) rotors = fma(V(plan.armature[i]) * velocity[i], velocity[i], rotors);
+    const V kinetic = fma(V(0.5), rotors, kinetic_energy(plan, rates));
+    store(record->q, after.q, plan.nq, plan.nq), store(record->v, velocity, plan.nv, plan.nv);
+    store(record->center_of_mass, center, D, D), store(record->linear_momentum, linear, D, D);
+    store(record->angular_momentum, angular, D, D);
+    store(record->kinetic_energy, &kinetic, 1, 1), store(record->potential_energy, &potential, 1, 1);
+    for (int k = 0; k < roster.links; k++) show(k);
+  }
+
+  // First moment, momentum and moment of momentum of all bodies, about the world's origin.
+  void sum_up(V* first, V* linear, V* angular) const {
+    for (int i = 0; i < D; i++) first[i] = linear[i] = angular[i] = V(0);
+    for (int k = 0; k < plan.nodes; k++) {
+      const V *R = balance.now.rotation + D * D * k, *rate = rates + 12 * k, mass = V(plan.mass[k]);
+      V x[D], speed[D], spread[D * D], moment[D * D], spin[D], levered[D];
+      times<D>(R, plan.center + D * k, x), times<D>(rate, plan.center + D * k, speed);
+      for (int i = 0; i < D; i++) {
+        x[i] += balance.now.position[D * k + i], speed[i] = mass * (speed[i] + rate[D * D + i]);
+        first[i] = fma(mass, x[i], first[i]), linear[i] += speed[i];
+      }
+      product<D>(rate, plan.second + D * D * k, spread);
+      product_transposed<D>(spread, R, moment);
+      curl<D>(moment, spin), cross(x, speed, levered);
+      for (int i = 0; i < D; i++) angular[i] += spin[i] + levered[i];
+    }
+  }
+
+  // Of gravity, springs, limits and the contacts' normal forces; `first`: the bodies' first moment.
+  V stored(const V* first) {
+    V sum = V(roster.still_energy[0]);
+    for (int i = 0; i < D; i++) sum = fma(-V(plan.gravity[i]), first[i], sum);
+    difference(plan, rest, after.q, gap);
+    for (int i = 0; i < plan.nv; i++) sum = fma(V(N(0.5) * plan.spring[i]) * gap[i], gap[i], sum);
+    each_limit(plan, after.q, [&](int i, V past) {
+      const V x = max(past, V(0));
+      sum = fma(V(plan.limit[i] / N(3)), x * x * x, sum);
+    });
+    each_kind(plan.contact, [&](auto pair, int from, int to) {
+      for (int i = from; i < to; i++) sum += balance.contacts.stored(pair, i);
+    });
+    return sum;
+  }
+
+  // A link's pose [3 × 4]; one without a node rides on the world.
+  void show(int link) const {
+    const N* frame = roster.frame + 12 * link;
+    const int k = roster.carrier[link];
+    V pose[12];
+    for (int i = 0; i < D; i++)
+      for (int j = 0; j < 4; j++) {
+        if (k < 0) {
+          pose[4 * i + j] = V(frame[4 * i + j]);
+          continue;
+        }
+        const V* R = balance.now.rotation + D * D * k + D * i;
+        V sum = j == D ? balance.now.position[D * k + i] : V(0);
+        for (int a = 0; a < D; a++) sum = fma(R[a], V(frame[4 * a + j]), sum);
+        pose[4 * i + j] = sum;
+      }
+    store(record->link_poses, pose, 12, 12 * roster.links, 12 * link);
+  }
+
+  // The contacts at the end of the step, and what is deepest beyond its measure.
+  void write_step() {
+    Contacts<V, N, D>& contacts = balance.contacts;
+    scheme.begin(balance, before, guess);
+    contacts.begin(balance.start, balance.target, balance.dt);
+    V worst = V(roster.still_strain[0]), number = V(N(roster.still_suspect));
+    auto strained = [&](V share, int danger) {  // of those strained alike, the first
+      const V own = V(N(danger));
+      const M more = (share > worst) | ((share >= worst) & (own < number));
+      worst = select(more, share, worst), number = select(more, own, number);
+    };
+    each_kind(plan.contact, [&](auto pair, int from, int to) {
+      for (int i = from; i < to; i++) {
+        Touching<V, D> t;
+        contacts.center(i, balance.now, t.center);
+        t.depth = contacts.depth(pair, i, balance.now, t.center, t.solid), t.holding = V(0);
+        contacts.touch(pair, i, t);
+        Force<V, D> found;
+        force<typename decltype(pair)::Support>(t, found);
+        const int slot = roster.slot[i];
+        store(record->depth, &t.depth, 1, roster.slots, slot), store(record->point, found.p, D, D * roster.slots, D * slot);
+        store(record->normal, t.solid.normal, D, D * roster.slots, D * slot);
+        store(record->force, found.f, D, D * roster.slots, D * slot), store(record->slip, found.u, D, D * roster.slots, D * slot);
+        const M far = (t.depth > V(0)) & contacts.turned_far(i);
+        strained(t.depth / V(plan.contact.deep[i]) + select(far, V(1), V(0)), roster.danger[i]);
+      }
+    });
+    if (roster.first_limit >= 0)
+      each_limit(plan, after.q, [&](int i, V past) { strained(max(past, V(-1)) / V(TOO_FAR), roster.first_limit + i); });
+    for (int i = 0; i < count; i++) record->suspect[at + i] = record->hazards[at + i] ? int(lane(number, i)) : -1;
+  }
+};
+
+}  // namespace pbfd
