@@ -10,7 +10,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 5; }
+int pbfd_interface() { return 6; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
