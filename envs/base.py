@@ -217,23 +217,24 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
     def _reset(self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if set_state and mask is None and tensordict is not None and "state" in tensordict:
-            state = dict(tensordict["state"].items())
-            return self._seen(unpacked(state, self._like), state)
+            flat = dict(tensordict["state"].items())
+            state = unpacked(flat, self._like)
+            # at a start an integrator's own velocity may be that of the step before it
+            v = torch.where(flat["steps"] == 0, flat["start_v"], self._velocity(self.simulator, state))
+            return self._seen(state.q, v, flat)
         where = torch.ones(self.batch_size, dtype=torch.bool, device=self.device) if mask is None else mask.reshape(self.batch_size)
         index = where.nonzero().squeeze(-1)
         fresh = self._begun(index.tolist()) if self._rows else self._taken(len(index))
         # rows that are not reset are not read: torchrl keeps those of the step
         whole = {name: value.new_zeros((*self.batch_size, *value.shape[1:])) for name, value in fresh.items()}
-        state = {name: value.index_copy(0, index, fresh[name]) for name, value in whole.items()}
-        return self._seen(unpacked(state, self._like), state)
+        flat = {name: value.index_copy(0, index, fresh[name]) for name, value in whole.items()}
+        return self._seen(flat["q"], flat["start_v"], flat)
 
-    def _seen(self, state: State, flat: Mapping[str, Tensor]) -> TensorDictBase:
+    def _seen(self, q: Tensor, v: Tensor, flat: Mapping[str, Tensor]) -> TensorDictBase:
         none = torch.zeros((*self.batch_size, 1), dtype=torch.bool, device=self.device)
-        # at a start an integrator's own velocity may be that of the step before it
-        v = torch.where(flat["steps"] == 0, flat["start_v"], self._velocity(self.simulator, state))
         return TensorDict(
             {
-                "observation": self.observe(state.q, v).float(),
+                "observation": self.observe(q, v).float(),
                 "unsolved": none,
                 "done": none.clone(),
                 "terminated": none.clone(),
@@ -309,7 +310,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
             if value.shape != (*self.batch_size, width):
                 raise InputError(f"{what} has shape {tuple(value.shape)}: must be {(*self.batch_size, width)}")
         flat = self._started(q, v, self._drawn(len(q), self._random))
-        return self._seen(unpacked(flat, self._like), flat)
+        return self._seen(flat["q"], flat["start_v"], flat)
 
     def _velocity(self, simulator: Simulator[Any], state: State) -> Tensor:
         return simulator.integrator.velocity(simulator.articulation, state, simulator.step_size)

@@ -147,8 +147,11 @@ class Simulator(Generic[S]):
         quaternions of no length."""
         q, v = self.scene.placed(q, v)
         control = self.scene.controlled(control, q.shape[:-1])
-        linked = Linked(self.eager, self.gradients)
-        return linked.initial_state(q, v, control) if linked.carry(q, v, control) else self.stepper.initial_state(q, v, control)
+        if self._carriers().may_carry(q, v, control):
+            linked = Linked(self.eager, self.gradients)
+            if linked.carry(q, v, control):
+                return linked.initial_state(q, v, control)
+        return self.stepper.initial_state(q, v, control)
 
     def objective(self, state: S, control: Tensor | None = None) -> BalanceObjective:
         """The balance of forces that the step from `state` solves."""
@@ -163,7 +166,7 @@ class Simulator(Generic[S]):
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
         theorem (`gradients.implicit`); it is then made in PyTorch, and its values are those of `Torch` to the bit."""
         control = self.scene.controlled(control, state.q.shape[:-1])
-        if self._carriers().may_carry(state, control):
+        if self._carriers().may_carry(*vars(state).values(), *state.memory, control):
             linked = Linked(self.eager, self.gradients)
             if linked.carry(state, control):
                 advanced, made = linked.step(state, control)

@@ -1,18 +1,23 @@
-"""Is the compiled core the reference? Its r and J at any configuration, and where its steps end."""
+"""Is the compiled core the reference? Its r and J at any configuration, where its steps end, and what its starts make of theirs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch import Scene, Simulator
-from pbfd_torch.integrators.energy_momentum import Velocities
-from pbfd_torch.integrators.integrator import fresh
-from pbfd_torch.native.stepper import NativeStepper
+from pbfd_torch.balance.dynamics import mass_matrix
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.integrator import Integrator, State, fresh
+from pbfd_torch.native.stepper import NativeStepper, spread
 from pbfd_torch.solvers.objective import Solution, Status
-from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import difference
 
 DT = 0.01
 
@@ -86,3 +91,83 @@ def require_steps(scene: Scene, start: Velocities, control: Tensor | None = None
         part, _, _ = native.take(some).made(state.take(some), held)
         assert torch.equal(part.q, whole.q[index])
         assert torch.equal(part.v, whole.v[index])
+
+
+SCHEMES: tuple[Integrator[Any], ...] = (EnergyMomentum(), ImplicitEuler())
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """The core's state at t = 0, where its trial step ended `[worlds, nq]` and with which status, and the reference's state that
+    follows from the same end."""
+
+    state: Any
+    end: Tensor
+    status: Tensor
+    reference: Any
+
+
+def begun(native: NativeStepper[Any], q: Tensor, v: Tensor, control: Tensor | None) -> Begun:
+    """A start of the core, and what the reference makes of its trial."""
+    held = q.new_zeros(1, native.scene.nu) if control is None else control[None]
+    journey, end = native._core.start(q, v, spread(held, q.shape[:-1]))
+    status = journey.counted["status"]
+
+    def attempt(_: EagerStepper[Any], state: Any, __: Tensor | None) -> tuple[Any, Tensor]:
+        return replaced(state, q=end), status <= int(Status.HALVED)
+
+    reference = native.eager.with_attempt(attempt).initial_state(q, v, control)
+    return Begun(native.initial_state(q, v, control), end, status, reference)
+
+
+def require_starts(scene: Scene, q: Tensor, v: Tensor, control: Tensor | None = None) -> None:
+    """By both schemes: where trial steps end are roots to the reference, and what is made of them is the reference's but for
+    rounding."""
+    for scheme in SCHEMES:
+        native = NativeStepper(Simulator(scene, DT, scheme).eager)
+        start = begun(native, q, v, control)
+        objective = trial_of(native.eager, q, v, control)
+        error = objective.error(objective.evaluate(start.end), 1e-9)
+        assert bool((error[start.status == int(Status.SOLVED)] <= 1e-9).all())
+        for name, ours, theirs in fields(start.state, start.reference):
+            assert float((ours - theirs).abs().max()) <= 1e-8 * (1.0 + float(theirs.abs().max())), name
+
+
+def fields(ours: State, theirs: State) -> list[tuple[str, Tensor, Tensor]]:
+    """The tensors of two states, side by side."""
+    pairs = [(name, x, getattr(theirs, name)) for name, x in vars(ours).items() if isinstance(x, Tensor)]
+    assert all(x.dtype == y.dtype and x.shape == y.shape for _, x, y in pairs)
+    return pairs
+
+
+def trial_of(eager: EagerStepper[Any], q: Tensor, v: Tensor, control: Tensor | None) -> Any:
+    """The balance of the trial step from q with v."""
+    scheme = ImplicitEuler()
+    stepper = eager.with_scheme(scheme, eager.solver, eager.halvings, eager.step_size)
+    return stepper.objective(scheme.at_rate(eager.articulation, q, v, torch.zeros_like(v), eager.step_size), control)
+
+
+def apart(eager: EagerStepper[Any], q: Tensor, v: Tensor, control: Tensor | None) -> Tensor:
+    """How far the accelerations of two trials may be apart, ‖a − a'‖ by M, `[worlds]`, where both have solved the same root.
+
+    Both have ‖r/s‖ ≤ τ, so J δq = δr with ‖δr/s‖ ≤ 2τ. What their forces differ by is δr less what inertia makes of δq, and where J
+    is no less than inertia alone, that is no more than δr again, in the norm of M⁻¹: ‖δa‖ ≤ 2 · 2τ √λ, λ the largest eigenvalue of
+    s M⁻¹ s."""
+    tolerance, objective = 1e-9, trial_of(eager, q, v, control)
+    size = objective.scale + objective.rounding / tolerance
+    felt = torch.linalg.inv(mass_matrix(eager.articulation, q, eager.scene.terms)) * size[..., None] * size[..., None, :]
+    return 4 * tolerance * torch.linalg.eigvalsh(felt)[..., -1].sqrt()
+
+
+def largest_gap(eager: EagerStepper[Any], q: Tensor, ours: Any, theirs: Any) -> Tensor:
+    """Of two states at t = 0, as an acceleration ‖a − a'‖ by M, `[worlds]`."""
+    a, dt = eager.articulation, eager.dt
+    inertia = mass_matrix(a, q, eager.scene.terms)
+    gaps = []
+    if isinstance(ours, Velocities):  # lag: of what two forces differ by
+        shares = (("v", 1.5 * dt), ("push", dt), ("steady", dt), ("lag", 2 * dt))
+        gaps += [(getattr(ours, name) - getattr(theirs, name)) / share for name, share in shares]
+    else:
+        gaps += [ours.acceleration - theirs.acceleration]
+        gaps += [difference(a, ours.q_previous, theirs.q_previous) / (0.5 * dt * dt)]
+    return torch.stack([(x[..., None, :] @ inertia @ x[..., None])[..., 0, 0].sqrt() for x in gaps]).amax(0)

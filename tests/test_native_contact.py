@@ -33,7 +33,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
-from tests.native_parity import DT, gaps, require_balance, require_steps, resting
+from tests.native_parity import DT, gaps, require_balance, require_starts, require_steps, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -123,9 +123,10 @@ def test_friction_of_each_world() -> None:
     )
     state, q = beside(scene, worlds)
     require_balance(scene, state, q)
-    require_steps(
-        scene.take(Worlds((worlds,), torch.arange(12))), beside(scene, worlds)[0].take(Worlds((worlds,), torch.arange(12)))
-    )
+    some = Worlds((worlds,), torch.arange(12))
+    scene, state = scene.take(some), state.take(some)
+    require_steps(scene, state)
+    require_starts(scene, state.q, state.v)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +170,9 @@ BALLS, CURVED = (Point(), Sphere(0.05), Sphere(0.02)), (Ellipsoid((0.08, 0.05, 0
 def test_balls_on_solids(solid: str) -> None:
     scene = touching(BALLS, (SOLIDS[solid], GROUND))
     require_alike(scene, 240)
-    require_steps(scene, beside(scene, 12, 5)[0])
+    state, _ = beside(scene, 12, 5)
+    require_steps(scene, state)
+    require_starts(scene, state.q, state.v)
 
 
 @pytest.mark.parametrize("solid", CONVEX)
@@ -180,13 +183,16 @@ def test_fast_balls_do_not_pass_through(solid: str) -> None:
     prepared = Simulator(scene, DT).eager.objective(state).prepared[1]
     assert 0.2 < float(prepared.surface.passed.double().mean()) < 0.8
     require_balance(scene, state, q)
+    require_starts(scene, state.q[:20], state.v[:20])
 
 
 @pytest.mark.parametrize("shape", CURVED)
 def test_curved_bodies_on_half_spaces(shape: Shape) -> None:
     scene = touching((shape,), (GROUND, WALL), CurvedContact)
     require_alike(scene, 120)
-    require_steps(scene, beside(scene, 12, 5)[0])
+    state, _ = beside(scene, 12, 5)
+    require_steps(scene, state)
+    require_starts(scene, state.q, state.v)
 
 
 @pytest.mark.parametrize("solid", sorted(SOLIDS.keys() - CONVEX.keys()))

@@ -13,7 +13,7 @@ from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.kinematics import retract
 from tests.bodies import diagonal
-from tests.native_parity import DT, require_balance, require_steps, resting
+from tests.native_parity import DT, require_balance, require_starts, require_steps, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -49,6 +49,7 @@ def test_limits_that_drives_press_on() -> None:
     q = retract(a, a.rest.expand(worlds, -1), moved)
     require_balance(scene, resting(retract(a, q, -DT * v), v), q, control)
     require_steps(scene, resting(q[:12], 0.1 * v[:12]), control[:12])
+    require_starts(scene, q[:12], 0.1 * v[:12], control[:12])
 
 
 def test_pushes() -> None:
@@ -62,3 +63,4 @@ def test_pushes() -> None:
     q = retract(a, a.rest.expand(20, -1), moved)
     require_balance(scene, resting(retract(a, q, -DT * v), v), q)
     require_steps(scene, resting(q, v))
+    require_starts(scene, q, v)

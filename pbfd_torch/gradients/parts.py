@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from pbfd_torch.integrators.integrator import S, State
+from pbfd_torch.integrators.integrator import S
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.structures import in_dtype, tensors_of
 from pbfd_torch.tensors.worlds import replaced
@@ -37,23 +37,20 @@ def carries(value: Tensor) -> bool:
 
 
 class Carriers:
-    """All tensors that a stepper's steps depend on besides the state and the control, to be asked before every step."""
+    """All tensors that a stepper's steps depend on besides the state and the control, to be asked before every step and start."""
 
     def __init__(self, stepper: EagerStepper[Any]) -> None:
         scene = stepper.scene
         self._tensors = tensors_of(Parts(scene.articulation, scene.terms, scene.gravity, stepper.step_size, ()))
 
-    def may_carry(self, state: State, control: Tensor | None) -> bool:
-        """Whether steps from a state may carry derivatives, or torch.func may be at work. The common case, that they do not, is
-        known without a look at each tensor's tangents."""
+    def may_carry(self, *given: Any) -> bool:
+        """Whether what is made of the tensors among these may carry derivatives, or torch.func may be at work. The common case,
+        that it does not, is known without a look at each tensor's tangents."""
         if forward_ad._current_level >= 0 or torch._C._functorch.peek_interpreter_stack() is not None:
             return True
         if not torch.is_grad_enabled():
             return False
-        given = [x for x in vars(state).values() if isinstance(x, Tensor)]
-        return any(x.requires_grad for x in (*self._tensors, *given, *state.memory)) or (
-            control is not None and control.requires_grad
-        )
+        return any(x.requires_grad for x in self._tensors) or any(x.requires_grad for x in given if isinstance(x, Tensor))
 
 
 def parts_of(stepper: EagerStepper[S]) -> Parts:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.calls import Calls, whole
@@ -25,24 +24,36 @@ WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another 
 
 @dataclass(frozen=True)
 class Scheme:
-    """An integrator that the core knows: its function there, and the fields of its states, those of coordinates or of degrees of
-    freedom `[*batch, n]` first, and numbers `[*batch]`."""
+    """An integrator that the core knows: its functions there, that of steps and that of starts, its states, and their fields:
+    coordinates `[*batch, nq]` first, those of degrees of freedom `[*batch, nv]`, and numbers `[*batch]`."""
 
     function: str
-    vectors: tuple[str, ...]
+    start: str
+    state: type[State]
+    coordinates: tuple[str, ...]
+    freedoms: tuple[str, ...]
     numbers: tuple[str, ...] = ()
 
     def fields(self, state: State) -> dict[str, Tensor]:
         """Those of a state, in the order of the core, all worlds one after the other."""
         batch = tuple(state.q.shape[:-1])
-        given = {name: whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in self.vectors}
+        vectors = self.coordinates + self.freedoms
+        given = {name: whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in vectors}
         return given | {name: whole(getattr(state, name), batch) for name in self.numbers}
 
+    def shapes(self, nq: int, nv: int) -> dict[str, tuple[int, ...]]:
+        """What the fields hold for each world."""
+        return dict.fromkeys(self.coordinates, (nq,)) | dict.fromkeys(self.freedoms, (nv,)) | dict.fromkeys(self.numbers, ())
 
+
+_ON_POSITIONS = Scheme("pbfd_implicit_euler", "pbfd_start_implicit_euler", Positions, ("q", "q_previous"), ("acceleration",))
 SCHEMES: dict[type, Scheme] = {
-    EnergyMomentum: Scheme("pbfd_energy_momentum", ("q", "v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
-    ImplicitEuler: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
-    Variational: Scheme("pbfd_implicit_euler", ("q", "q_previous", "acceleration")),
+    EnergyMomentum: Scheme(
+        *("pbfd_energy_momentum", "pbfd_start_energy_momentum", Velocities),
+        *(("q",), ("v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
+    ),
+    ImplicitEuler: _ON_POSITIONS,
+    Variational: _ON_POSITIONS,
 }
 
 
@@ -57,6 +68,7 @@ class _Steps(ctypes.Structure):
         ("counted", ctypes.c_void_p * len(COUNTED)),
         ("fallbacks", ctypes.c_void_p),
         ("grip", ctypes.c_void_p),
+        ("trial", ctypes.c_void_p * 7),
     )
 
 
@@ -76,31 +88,25 @@ class Journey:
     """Steps of all worlds: what they are to be made of, and room for what they come to.
 
     Attributes:
-        given: the fields of the state `[*batch, ...]` that each world sets out from.
+        given: what each world sets out from, `[*batch, ...]`, q first.
         control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
-        fields: of the state after each step, with its memory, `[*steps, *batch, ...]`; steps: how many, or nothing for a single
-            one.
+        found: what it has after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
         residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
     """
 
-    def __init__(self, scheme: Scheme, state: State, control: Tensor, steps: tuple[int, ...], plan: Plan) -> None:
-        batch = tuple(state.q.shape[:-1])
+    def __init__(
+        self, given: dict[str, Tensor], found: dict[str, Tensor], control: Tensor, steps: tuple[int, ...], grip: Tensor | None
+    ) -> None:
+        self.given, self.found = given, found
+        batch = tuple(given["q"].shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
-        self.given = scheme.fields(state)
-        if any(plan.anchors):
-            self.given["memory"] = whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
         self.control = whole(control, (len(control), *batch, control.shape[-1]))
-        self.grip = None if plan.grip is None else whole(plan.grip, (*batch, plan.grip.shape[-1]))
-        self.found = {name: _room_for(x, steps) for name, x in self.given.items()}
-        self.residual_norm = state.q.new_empty((*steps, *batch))
+        self.grip = None if grip is None else whole(grip, (*batch, grip.shape[-1]))
+        self.residual_norm = control.new_empty((*steps, *batch))
         first, *others = COUNTED
         self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
         self.counted |= {name: torch.empty_like(self.counted[first]) for name in others}
         self.fallbacks = torch.empty((*steps, *batch, len(FALLBACKS)), dtype=torch.int32)
-        memory = tuple(x.expand(*steps, *x.shape) for x in state.memory)  # there is nothing in it without anchors
-        if any(plan.anchors):
-            memory = self.found["memory"].split(plan.anchors, -2)
-        self.fields: dict[str, Any] = self.found | {"memory": memory}
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
@@ -120,7 +126,7 @@ class Journey:
         """How the steps were solved, `[*steps, *batch, ...]`."""
         counted = {name: x for name, x in self.counted.items() if name != "hazards"}
         lanes = int(counted["evaluations"].sum())
-        return Solution(self.fields["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
+        return Solution(self.found["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
 
 
 class Core:
@@ -134,21 +140,47 @@ class Core:
     def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
-        journey = Journey(self._scheme, state, control, steps, self.plan)
+        given = fields(self._scheme, self.plan, state)
+        journey = Journey(given, {name: _room_for(x, steps) for name, x in given.items()}, control, steps, self.plan.grip)
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
+
+    def start(self, q: Tensor, v: Tensor, control: Tensor) -> tuple[Journey, Tensor]:
+        """The fields of the states at t = 0 of all worlds at q `[*batch, nq]` with v `[*batch, nv]` under a control `[1, *batch,
+        nu]`, and how their trial steps were solved; and where these have ended, `[*batch, nq]`."""
+        given = {"q": whole(q, q.shape), "v": whole(v, v.shape)}
+        journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.grip)
+        asked = journey.call(self._terms)
+        (_, *before), end = self._empty(_ON_POSITIONS, q).values(), self._empty(_ON_POSITIONS, q)
+        asked.trial[:] = [x.data_ptr() for x in (*before, *end.values())]
+        self._calls.share(self._scheme.start, asked, asked.worlds, asked.worlds // WORTH_A_BLOCK)
+        return journey, end["q"]
+
+    def _empty(self, scheme: Scheme, q: Tensor) -> dict[str, Tensor]:
+        """Room for the fields of a state of worlds at q `[*batch, nq]`, its memory among them."""
+        _, nq, nv, _ = self.plan.sizes[:4]
+        shapes = scheme.shapes(nq, nv) | {"memory": (sum(self.plan.anchors), 3)}
+        return {name: q.new_empty((*q.shape[:-1], *shape)) for name, shape in shapes.items()}
 
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
         """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(self._scheme, state, held, (), self.plan)
+        journey = Journey(fields(self._scheme, self.plan, state), {}, held, (), self.plan.grip)
         at, residual, jacobian = whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         self._calls.make("pbfd_balance", journey.call(self._terms), *addresses)
         return residual, jacobian
+
+
+def fields(scheme: Scheme, plan: Plan, state: State) -> dict[str, Tensor]:
+    """Those of a state that the core reads, its memory last, where there are anchors."""
+    given = scheme.fields(state)
+    if any(plan.anchors):
+        given["memory"] = whole(torch.cat(state.memory, -2), (*state.q.shape[:-1], sum(plan.anchors), 3))
+    return given
 
 
 def _room_for(given: Tensor, steps: tuple[int, ...]) -> Tensor:

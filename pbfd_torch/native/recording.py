@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.calls import Calls, whole
-from pbfd_torch.native.core import SCHEMES
+from pbfd_torch.native.core import SCHEMES, fields
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan, planned_in_space
 from pbfd_torch.native.roster import CONTACT, rostered
@@ -38,8 +38,8 @@ class _Record(ctypes.Structure):
     _fields_ = (
         ("dt", ctypes.c_double),
         *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
-        ("given", ctypes.c_void_p * 9),
-        ("found", ctypes.c_void_p * 9),
+        ("given", ctypes.c_void_p * 10),
+        ("found", ctypes.c_void_p * 10),
         *((name, ctypes.c_void_p) for name in ("hazards", "grip", *_STATE, *CONTACT, "suspect")),
     )
 
@@ -51,7 +51,7 @@ class Writer(Generic[S]):
         self.scene, self.dt = eager.scene, eager.dt
         space = plan if plan.dimension == 3 else planned_in_space(eager)
         self.roster = rostered(eager, space)
-        self._scheme = SCHEMES[type(eager.integrator)]
+        self._scheme, self._plan = SCHEMES[type(eager.integrator)], plan
         self._calls, self._grip = Calls(library, space, threads), space.grip
         r = self.roster
         self._roster = _Roster(len(r.carrier), r.slots, r.first_limit, r.still_suspect)
@@ -61,7 +61,7 @@ class Writer(Generic[S]):
     def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
         """Of steps from the state before the first to those after each `[steps, *batch, …]`, in arrays of this length: the state
         after each, and its contacts if there is a `suspect`; `hazards` are there already."""
-        given, found = self._scheme.fields(before), self._scheme.fields(states)
+        given, found = (fields(self._scheme, self._plan, x) for x in (before, states))
         batch = tuple(before.q.shape[:-1])
         worlds, steps = math.prod(batch), math.prod(states.q.shape[:-1])
         asked = _Record(self.dt, worlds, 0, steps)

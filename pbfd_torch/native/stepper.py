@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, Generic
+from typing import Any, Generic, cast
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
-from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.integrator import Integrator, S, fresh
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.core import SCHEMES, Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
@@ -87,29 +87,41 @@ class NativeStepper(Generic[S]):
         return self.eager.halvings
 
     def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
-        """See `Stepper`: in PyTorch."""
-        return self.eager.initial_state(q, v, control)
+        """See `Stepper`."""
+        batch = q.shape[:-1]
+        controls = q.new_zeros(1, self.scene.nu) if control is None else control[None]
+        journey, _ = self._core.start(q, v, spread(controls, batch))
+        fields = fresh(q) | journey.found | {"memory": blank_memory(self.scene.terms, tuple(batch))}
+        return cast(S, SCHEMES[type(self.integrator)].state(**fields))
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
         journey = self._went(state, None if control is None else control[None], ())
         solution = journey.solution
-        time, hazards = state.time + self.step_size, journey.counted["hazards"]
-        return replaced(state, **journey.fields, time=time, hazards=hazards), solution, Way(solution.q)
+        return self._after(state, journey, state.time + self.step_size), solution, Way(solution.q)
 
     def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
         after each, `[steps, *batch, ...]`, and how each was solved."""
         journey = self._went(state, controls, (steps,))
         time = torch.cat((state.time[None], self.step_size.expand(steps, *state.time.shape))).cumsum(0)[1:]
-        hazards = journey.counted["hazards"]
-        return replaced(state, **journey.fields, time=time, hazards=hazards), journey.solution
+        return self._after(state, journey, time), journey.solution
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
         """The states after steps, and how these were solved."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
         return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps)
+
+    def _after(self, state: S, journey: Journey, time: Tensor) -> S:
+        """The states after steps from a state, at these times."""
+        found, anchors = journey.found, self._core.plan.anchors
+        memory = state.memory
+        if any(anchors):
+            memory = found["memory"].split(anchors, -2)
+        elif time.ndim > state.time.ndim:  # there is nothing in it
+            memory = tuple(x.expand(len(time), *x.shape) for x in memory)
+        return replaced(state, **found | {"time": time, "hazards": journey.counted["hazards"], "memory": memory})
 
     def complete(self, state: S) -> S:
         """With zero for an acceleration that is not known, and anchors where there is nothing in the memory yet."""

@@ -61,7 +61,7 @@ struct Run {
   int worlds, steps;
   std::vector<int> widths;
   std::vector<Numbers> given, found;
-  Numbers residual_norm;
+  Numbers residual_norm, trial[5];
   std::vector<int> counted[4], fallbacks;
 
   Run(int count, int length, std::vector<int> sizes) : worlds(count), steps(length), widths(sizes) {
@@ -69,13 +69,15 @@ struct Run {
     for (int w = 0; w < count; w++) given[0][w * NQ + 3] = 1;
     residual_norm.resize(count * length), fallbacks.resize(4 * count * length);
     for (auto& x : counted) x.resize(count * length);
+    for (auto& x : trial) x.resize(count * NQ);
   }
 
   void make(const Scene& scene, Step step, double dt) {
     void* room = std::aligned_alloc(64, (pbfd_room(&scene.plan) + 127) / 64 * 64);
-    pbfd_steps s{dt, 1e-9, 1e-3, 1, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), nullptr};
+    pbfd_steps s{dt, 1e-9, 1e-3, 1, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), nullptr, {}};
     for (std::size_t i = 0; i < given.size(); i++) s.given[i] = given[i].data(), s.found[i] = found[i].data();
     for (int i = 0; i < 4; i++) s.counted[i] = counted[i].data();
+    for (int i = 0; i < 5; i++) s.trial[i] = trial[i].data();
     step(&scene.plan, &s, room);
     std::free(room);
   }

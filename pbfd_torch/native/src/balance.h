@@ -68,15 +68,9 @@ template <class V, class N, int D = 3> struct Balance {
   // r at q; J by `assemble`.
   void evaluate(const V* q) {
     place(plan, q, now, axes);
-    for (int k = 0; k < plan.nodes; k++) {
-      to_chord(k);
-      pushes[k].any = false;
-    }
+    for (int k = 0; k < plan.nodes; k++) to_chord(k);
     pull_all();
-    contacts.look(now), contacts.press(pushes);
-    if constexpr (D == 3) push_from_outside(plan, now, pushes);
-    for (int k = plan.nodes - 1; k > 0; k--)
-      if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
+    press();
     for (int i = 0; i < plan.nv; i++) residual[i] = slopes[i] = V(0);
     joint_loads(plan, steps(), q, residual, slopes);
     for (int k = 0; k < plan.nodes; k++)
@@ -85,6 +79,21 @@ template <class V, class N, int D = 3> struct Balance {
         residual[j] += dot<T>(s, pulls[k].torque) + dot<D>(s + T, pulls[k].force);
         if (pushes[k].any) residual[j] += worked<D>(axes + S * j, pushes[k].moment, pushes[k].force);
       }
+  }
+
+  // What contacts and forces from outside do where the nodes are, summed up over all that each joint moves.
+  template <bool CONTACTS = true, bool OUTSIDE = true> void press() {
+    for (int k = 0; k < plan.nodes; k++) pushes[k].any = false;
+    if constexpr (CONTACTS) contacts.look(now), contacts.press(pushes);
+    if constexpr (OUTSIDE && D == 3) push_from_outside(plan, now, pushes);
+    for (int k = plan.nodes - 1; k > 0; k--)
+      if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
+  }
+  // Adds the residual of it.
+  void add_pushed(V* out) const {
+    for (int k = 0; k < plan.nodes; k++)
+      for (int j = plan.v[k]; pushes[k].any && j < plan.v[k] + freedoms(plan.kind[k]); j++)
+        out[j] += worked<D>(axes + S * j, pushes[k].moment, pushes[k].force);
   }
 
   // J, or with `curved` false the stiffness: J without how the axes turn under the forces. After it J needs another `evaluate`.

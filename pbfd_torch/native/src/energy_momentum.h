@@ -1,5 +1,7 @@
 // The state after an energy–momentum step, and what it has gained beyond the forces' work, as integrators/energy_momentum.py.
 #pragma once
+#include "forces.h"
+#include "momenta.h"
 #include "state.h"
 #include "strayed.h"
 
@@ -20,26 +22,22 @@ template <class V> struct Velocities {
 };
 
 template <class V, class N, int D = 3> struct EnergyMomentum {
-  static constexpr int T = turns(D), S = T + D;
   using M = typename Kind<V>::Mask;
   using State = Velocities<V>;
-  static constexpr int easier = 1;  // inertia at the end of the step, as the paper has it
+  static constexpr int easier = 1;    // inertia at the end of the step, as the paper has it
+  static constexpr bool fits = true;  // springs, damping and actuators may be taken at a share of the step
   static double share(int eased) { return eased ? 1.0 : 0.5; }
 
   const Plan<N, D>& plan;
   V surplus_allowed;  // of the largest kinetic energy so far
-  V *twist, *rates, *momentum, *impulse, *smooth, *rough, *other, *matrix, *total, *room_to_begin;
-  Pull<V, D>* sums;
+  Momenta<V, N, D> momenta;
+  V *momentum, *impulse, *smooth, *rough, *other, *total, *room_to_begin;
 
-  static int room(Sizes s) {
-    return s.nodes * (6 + 12 + 18 + int(sizeof(Pull<V, D>) / sizeof(V))) + 6 * s.nv + s.nv * s.nv;
-  }
-  EnergyMomentum(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), surplus_allowed(1e-3) {
-    twist = arena.take(6 * plan.nodes), rates = arena.take(12 * plan.nodes);
+  static int room(Sizes s) { return Momenta<V, N, D>::room(s) + 18 * s.nodes + 6 * s.nv; }
+  EnergyMomentum(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), surplus_allowed(1e-3), momenta(scene, arena) {
     momentum = arena.take(plan.nv), impulse = arena.take(plan.nv), smooth = arena.take(plan.nv), rough = arena.take(plan.nv);
-    other = arena.take(plan.nv), total = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
+    other = arena.take(plan.nv), total = arena.take(plan.nv);
     room_to_begin = arena.take(18 * plan.nodes);
-    sums = reinterpret_cast<Pull<V, D>*>(arena.take(plan.nodes * int(sizeof(Pull<V, D>) / sizeof(V))));
   }
 
   void ask(const Rules& rules) { surplus_allowed = V(typename Kind<V>::Scalar(rules.surplus)); }
@@ -51,7 +49,7 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
 
   // How fast poses change at t_n, where the nodes are and the velocity is known.
   void speeds(const State&, Poses<V> now, const V* axes, const V* velocity, V, V* out) {
-    pose_rates(plan, now, axes, velocity, twist, out);
+    pose_rates(plan, now, axes, velocity, momenta.twist, out);
   }
 
   // What is fixed in the step from a state, and where it may end.
@@ -92,13 +90,14 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     const int n = plan.nv;
     const V h = b.dt, per = V(1) / h, zero(0), half(0.5);
     const M on_chord = b.share < V(1);
-    split_forces(b, q);
+    forces_by_share(b, q, rough, smooth, other);
     difference(plan, b.q_start, q, after.average);
     for (int i = 0; i < n; i++) after.average[i] = per * after.average[i];
 
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions; at the end of the step, ΔT/Δt and half its fall
     const V factor = select(on_chord, V(2), V(1)), less = select(on_chord, V(-1), zero), fall = select(on_chord, zero, half * h);
-    pose_rates(plan, b.start, b.start_axes, before.v, twist, rates);
+    V* rates = momenta.rates;
+    pose_rates(plan, b.start, b.start_axes, before.v, momenta.twist, rates);
     for (int k = 0; k < plan.nodes; k++) {
       const V* rate = rates + (D * D + D) * k;
       V next[D * D + D];
@@ -108,22 +107,20 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
         const V kept = fma(less, rate[D * D + i], fall * V(plan.gravity[i]));
         next[D * D + i] = fma(factor * per, b.now.position[D * k + i] - b.start.position[D * k + i], kept);
       }
-      pushed(k, b.now, next, sums[k]);
+      momenta.take(k, b.now, next);
     }
-    sum_up();
     for (int i = 0; i < n; i++) {
       impulse[i] = h * rough[i];
       momentum[i] = V(plan.armature[i]) * fma(factor, after.average[i], less * before.v[i]);
     }
-    each_freedom([&](int k, int i) {
-      momentum[i] += dot<T>(b.axes + S * i, sums[k].torque) + dot<D>(b.axes + S * i + T, sums[k].force);
-    });
+    momenta.add_to(momentum, b.axes);
     for (int i = 0; i < n; i++) {
       const V ahead = early(b, i);
       momentum[i] += h * select(on_chord, -fma(ahead, smooth[i], rough[i]), half * (V(1) - ahead) * smooth[i]);
     }
 
-    masses(b);
+    V* matrix = momenta.matrix;
+    momenta.masses(b.axes);
     for (int i = 0; i < n; i++) {
       V row(0);
       for (int j = 0; j < n; j++) row = fma(matrix[i * n + j], before.v[j], row);
@@ -142,9 +139,9 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     substitute_along_the_tree(plan, matrix, after.lag);
 
     for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
-    const V first = kinetic(b.start, b.start_axes, total);
+    const V first = momenta.kinetic(b.start, b.start_axes, total);
     for (int i = 0; i < n; i++) total[i] = fma(half, after.steady[i], after.v[i]);
-    const V last = kinetic(b.now, b.axes, total);
+    const V last = momenta.kinetic(b.now, b.axes, total);
     V work(0), spurious(0), turned(0);
     for (int i = 0; i < n; i++) {
       work = fma(h * (rough[i] + smooth[i]), after.average[i], work);
@@ -175,71 +172,6 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
  private:
   // The share of smooth forces that comes early.
   V early(const Balance<V, N, D>& b, int i) const { return fma(V(2), b.fitted[i], V(-1)); }
-
-  template <class F> void each_freedom(F&& visit) const {
-    for (int k = 0; k < plan.nodes; k++)
-      for (int i = plan.v[k]; i < plan.v[k] + freedoms(plan.kind[k]); i++) visit(k, i);
-  }
-  // Generalised forces of contacts, limits and dry friction, and of what is `Fitted`, as if taken whole.
-  void split_forces(const Balance<V, N, D>& b, const V* q) {
-    const JointStep<V> step = b.steps();
-    for (int i = 0; i < plan.nv; i++) smooth[i] = rough[i] = other[i] = V(0);  // slopes are not asked for
-    joint_loads<SMOOTH>(plan, step, q, smooth, other);
-    joint_loads<ROUGH>(plan, step, q, rough, other);
-    each_freedom([&](int k, int i) {
-      if (b.pushes[k].any) rough[i] += worked<D>(b.axes + S * i, b.pushes[k].moment, b.pushes[k].force);
-    });
-    for (int i = 0; i < plan.nv; i++) smooth[i] = -smooth[i] / b.fitted[i], rough[i] = -rough[i];
-  }
-
-  // The moment of the momenta of a node whose pose changes at `rate`.
-  void pushed(int k, Poses<V> at, const V* rate, Pull<V, D>& out) const {
-    const N *center = plan.center + D * k, *second = plan.second + D * D * k;
-    const V *R = at.rotation + D * D * k, mass = V(plan.mass[k]);
-    V spread[D * D], moment[D * D], x[D], speed[D], torque[T];
-    product<D>(rate, second, spread);
-    product_transposed<D>(spread, R, moment);
-    times<D>(R, center, x), times<D>(rate, center, speed);
-    for (int i = 0; i < D; i++) {
-      x[i] += at.position[D * k + i];
-      out.force[i] = mass * (speed[i] + rate[D * D + i]), out.first[i] = mass * x[i];
-    }
-    curl<D>(moment, out.torque), lever<D>(x, out.force, torque);
-    for (int i = 0; i < T; i++) out.torque[i] += torque[i];
-    // beside it, what the mass matrix needs
-    product<D>(R, second, spread);
-    product_transposed<D>(spread, R, moment);
-    for (int i = 0; i < D; i++)
-      for (int j = 0; j < D; j++) moment[D * i + j] = fma(out.first[i], x[j], moment[D * i + j]);
-    resistance<D>(moment, out.turning);
-    out.any = true;
-  }
-  void sum_up() {
-    for (int k = plan.nodes - 1; k > 0; k--)
-      if (plan.parent[k] >= 0) sums[plan.parent[k]].add(sums[k]);
-  }
-
-  V kinetic(Poses<V> at, const V* axes, const V* v) {
-    pose_rates(plan, at, axes, v, twist, rates);
-    V rotors(0);
-    for (int i = 0; i < plan.nv; i++) rotors = fma(V(plan.armature[i]) * v[i], v[i], rotors);
-    return fma(V(0.5), rotors, kinetic_energy(plan, rates));
-  }
-
-  // M [nv × nv] at the end of the step.
-  void masses(const Balance<V, N, D>& b) {
-    const int n = plan.nv;
-    for (int i = 0; i < n * n; i++) matrix[i] = V(0);
-    each_freedom([&](int k, int j) {
-      const Pull<V, D>& p = sums[k];
-      V below[S];
-      answer(p, V(plan.carried[k]), p.first, b.axes + S * j, below);
-      for (int up = k; up >= 0; up = plan.parent[up])
-        for (int i = plan.v[up]; i < (up == k ? j + 1 : plan.v[up] + freedoms(plan.kind[up])); i++)
-          matrix[i * n + j] = matrix[j * n + i] = dot<S>(b.axes + S * i, below);
-      matrix[j * n + j] += V(plan.armature[j]);
-    });
-  }
 };
 
 }  // namespace pbfd

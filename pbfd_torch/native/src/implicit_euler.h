@@ -6,8 +6,6 @@
 
 namespace pbfd {
 
-constexpr double HARDEST = 3.0;  // a gain of velocity is no impact's that has no more energy than a fall of so many steps
-
 // Attributes as of `Positions` in Python, [nq] and [nv], and its memory.
 template <class V> struct Positions {
   V *q, *q_previous, *acceleration, *behind;
@@ -20,6 +18,7 @@ template <class V> struct Positions {
 template <class V, class N, int D> struct ImplicitEuler {
   using M = typename Kind<V>::Mask;
   using State = Positions<V>;
+  static constexpr bool fits = false;
   static constexpr double BLENDS[] = {0.25, 0.5, 0.75, 1.0};  // what is easier to solve
 
   const Plan<N, D>& plan;
@@ -85,8 +84,8 @@ template <class V, class N, int D> struct ImplicitEuler {
     difference(plan, before.q, q, gained);
     for (int i = 0; i < plan.nv; i++) gained[i] = (gained[i] - moved[i]) / b.dt;
     pose_rates(plan, b.start, b.start_axes, gained, twist, rates);
-    const M calm = kinetic_energy(plan, rates) <= V(HARDEST * HARDEST) * falling_energy(plan, b.dt);
-    for (int i = 0; i < plan.nv; i++) after.acceleration[i] = select(calm, gained[i] / b.dt, V(0));
+    const M smooth = calm(plan, rates, b.dt);
+    for (int i = 0; i < plan.nv; i++) after.acceleration[i] = select(smooth, gained[i] / b.dt, V(0));
     for (int i = 0; i < plan.nq; i++) after.q_previous[i] = before.q[i];
     return M(false);
   }

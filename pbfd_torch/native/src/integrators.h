@@ -14,6 +14,31 @@ template <class V, class N, int D> inline void twists(const Plan<N, D>& plan, co
   }
 }
 
+// V̇ = Σ ṡ_i v_i, ṡ_i = ad(V_carrier) s_i, of all nodes: how the twists V of a steady v [nv] change.
+template <class V, class N, int D> inline void drifts(const Plan<N, D>& plan, const V* axes, const V* twist, const V* v, V* out) {
+  constexpr int T = turns(D), S = T + D;
+  for (int k = 0; k < plan.nodes; k++) {
+    V carrier[S];
+    for (int a = 0; a < S; a++) {
+      carrier[a] = plan.parent[k] < 0 ? V(0) : twist[S * plan.parent[k] + a];
+      out[S * k + a] = plan.parent[k] < 0 ? V(0) : out[S * plan.parent[k] + a];
+    }
+    const int first = plan.v[k], last = first + freedoms(plan.kind[k]), rotation = plan.kind[k] == FREE ? first + 3 : first;
+    for (int j = first; j < rotation; j++) carrier[T + j - first] += v[j];  // its translation carries its rotation
+    for (int j = rotation; j < last; j++) {
+      const V* s = axes + S * j;
+      V moved[D], back[D];
+      swing<D>(carrier, s + T, moved), swing<D>(s, carrier + T, back);
+      for (int a = 0; a < D; a++) out[S * k + T + a] = fma(v[j], moved[a] - back[a], out[S * k + T + a]);
+      if constexpr (D == 3) {
+        V turned[3];
+        cross(carrier, s, turned);
+        for (int a = 0; a < 3; a++) out[S * k + a] = fma(v[j], turned[a], out[S * k + a]);
+      }
+    }
+  }
+}
+
 // How fast all poses change that move with v [nv]: Ṫ = [V] T, rotation and position. twist: room, [6] each.
 template <class V, class N, int D>
 inline void pose_rates(const Plan<N, D>& plan, Poses<V> at, const V* axes, const V* v, V* twist, V* out) {
@@ -29,6 +54,21 @@ inline void pose_rates(const Plan<N, D>& plan, Poses<V> at, const V* axes, const
     }
     swing<D>(w, at.position + D * k, out + D * D);
     for (int i = 0; i < D; i++) out[D * D + i] += w[T + i];
+  }
+}
+
+// T̈ = ([V̇] + [V]²) T of node k, whose twists are V and change at V̇.
+template <int D, class V>
+inline void pose_acceleration(int k, Poses<V> at, const V* twist, const V* drift, V* out) {
+  constexpr int T = turns(D), S = T + D;
+  const V *w = twist + S * k, *change = drift + S * k, *R = at.rotation + D * D * k;
+  for (int j = 0; j <= D; j++) {
+    V x[D], speed[D], gain[D];
+    for (int i = 0; i < D; i++) x[i] = j < D ? R[D * i + j] : at.position[D * k + i];
+    swing<D>(w, x, speed), swing<D>(change, x, gain);
+    for (int i = 0; j == D && i < D; i++) speed[i] += w[T + i], gain[i] += change[T + i];
+    add_swing<D>(w, speed, gain);
+    for (int i = 0; i < D; i++) out[j < D ? D * i + j : D * D + i] = gain[i];
   }
 }
 
@@ -65,6 +105,13 @@ template <class V, class N, int D> inline V falling_energy(const Plan<N, D>& pla
   for (int i = 0; i < D; i++) g[i] = V(plan.gravity[i]);
   const V strength = max(sqrt(dot<D>(g, g)), V(1));
   return V(0.5) * mass * (dt * strength) * (dt * strength);
+}
+
+constexpr double HARDEST = 3.0;
+
+// Whether what a step gains, in rates of the poses, is no impact's: it has no more energy than a fall of `HARDEST` steps.
+template <class V, class N, int D> inline typename Kind<V>::Mask calm(const Plan<N, D>& plan, const V* rates, V dt) {
+  return kinetic_energy(plan, rates) <= V(HARDEST * HARDEST) * falling_energy(plan, dt);
 }
 
 // The energy–momentum step from q_n with v_n: κ = 1/Δt², T̂ = T_n + Δt V_n + ½ Δt² [0 | g]. room: 18 per node.

@@ -39,6 +39,7 @@ struct pbfd_steps {
   int* counted[4];
   int* fallbacks;
   const void* grip;  // μ of the candidates, [worlds, candidates]; null: the plan's
+  void* trial[7];    // of starts: room for what their trial is given but q, and for what it finds, of `Positions`
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.
@@ -49,6 +50,10 @@ PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 // Steps by Newton's method with all fallbacks.
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
+
+// States at t = 0 of worlds that are given by q, v and one control, found as after one step. What is reported is the trial step.
+PBFD_FUNCTION void pbfd_start_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
+PBFD_FUNCTION void pbfd_start_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
 
 // What a record lists beside what a plan in space knows.
 //   carrier: node of each link, −1: it rides on the world; frame: [links, 12] rotation and position, row by row, of the links there;
@@ -71,8 +76,8 @@ struct pbfd_roster {
 struct pbfd_record {
   double dt;
   int worlds, first, last;
-  const void* given[9];
-  const void* found[9];
+  const void* given[10];
+  const void* found[10];
   const int* hazards;
   const void* grip;
   void *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;

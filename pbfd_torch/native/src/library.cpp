@@ -1,12 +1,12 @@
 // The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
 #include "interface.h"
 
-#include "inspection.h"
-#include "machine.h"
-#include "record.h"
-#include "target.h"
-
 #include <algorithm>
+
+#include "inspection.h"
+#include "record.h"
+#include "starts.h"
+#include "target.h"
 
 using namespace pbfd;
 
@@ -22,17 +22,34 @@ Sizes sizes(const pbfd_plan* p) {
   return {{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
 }
 
-template <template <class, class, int> class Scheme, class V, int D>
-void make(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  using T = typename Kind<V>::Scalar;
-  Arena<V> arena{static_cast<V*>(room)};
-  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
-  Machine<V, T, D, Scheme<V, T, D>> machine(plan, arena);
-  machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
-  const Journey<T> journey{s->worlds, s->steps, s->held != 0, s->given, static_cast<const T*>(s->control), s->found,
-                           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
-  machine.run(journey, Rules{s->dt, s->tolerance, s->surplus, s->share, p->halvings, s->evaluations}, s->first, s->last);
+template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* given, void* const* found) {
+  return {s->worlds, s->steps, s->held != 0, given, static_cast<const T*>(s->control), found,
+          static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
 }
+
+Rules rules(const pbfd_plan* p, const pbfd_steps* s) { return {s->dt, s->tolerance, s->surplus, s->share, p->halvings, s->evaluations}; }
+
+// Steps of a scheme, and starts.
+template <template <class, class, int> class Scheme> struct Going {
+  template <class V, class T, int D>
+  static void make(const Plan<T, D>& plan, const pbfd_plan* p, const pbfd_steps* s, Arena<V> arena) {
+    Machine<V, T, D, Scheme<V, T, D>> machine(plan, arena);
+    machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
+    machine.run(journey<T>(s, s->given, s->found), rules(p, s), s->first, s->last);
+  }
+};
+
+template <template <class, class, int> class Scheme> struct Starting {
+  template <class V, class T, int D>
+  static void make(const Plan<T, D>& plan, const pbfd_plan* p, const pbfd_steps* s, Arena<V> arena) {
+    Starts<V, T, D, Scheme<V, T, D>> starts(plan, arena);
+    starts.balance.contacts.own_grip = static_cast<const T*>(s->grip);
+    const void* before[] = {s->given[0], s->trial[0], s->trial[1], s->trial[2]};
+    Rules trial = rules(p, s);
+    trial.share = 1;
+    starts.run(journey<T>(s, before, s->trial + 3), trial, s->trial, static_cast<const T*>(s->given[1]), s->found, s->first, s->last);
+  }
+};
 
 template <class T, int D>
 void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
@@ -45,19 +62,21 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
 }
 
 // A single world is spared the work of lanes that nobody needs.
-template <template <class, class, int> class Scheme, class T, int D> void make_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class What, class T, int D> void make_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  using Several = Lanes<T, register_bytes / int(sizeof(T))>;
+  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
   if (s->last - s->first == 1)
-    make<Scheme, T, D>(p, s, room);
+    What::make(plan, p, s, Arena<T>{static_cast<T*>(room)});
   else
-    make<Scheme, Lanes<T, register_bytes / int(sizeof(T))>, D>(p, s, room);
+    What::make(plan, p, s, Arena<Several>{static_cast<Several*>(room)});
 }
 
-template <template <class, class, int> class Scheme> void make_by(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+template <class What> void make_by(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   const bool plane = p->dimension == 2;
   if (p->bytes == 8)
-    plane ? make_of<Scheme, double, 2>(p, s, room) : make_of<Scheme, double, 3>(p, s, room);
+    plane ? make_of<What, double, 2>(p, s, room) : make_of<What, double, 3>(p, s, room);
   else
-    plane ? make_of<Scheme, float, 2>(p, s, room) : make_of<Scheme, float, 3>(p, s, room);
+    plane ? make_of<What, float, 2>(p, s, room) : make_of<What, float, 3>(p, s, room);
 }
 
 template <template <class, class, int> class Scheme, class T>
@@ -86,10 +105,10 @@ void record_by(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, v
 // Room for lanes V, in V; a plane needs less.
 template <class V> int room_of(Sizes s) {
   using T = typename Kind<V>::Scalar;
-  using One = EnergyMomentum<V, T, 3>;
-  using Other = ImplicitEuler<V, T, 3>;
-  return std::max({Machine<V, T, 3, One>::room(s), Machine<V, T, 3, Other>::room(s), Recorder<V, T, One>::room(s),
-                   Recorder<V, T, Other>::room(s)});
+  using First = EnergyMomentum<V, T, 3>;
+  using Second = ImplicitEuler<V, T, 3>;
+  return std::max({Machine<V, T, 3, First>::room(s), Machine<V, T, 3, Second>::room(s), Starts<V, T, 3, First>::room(s),
+                   Starts<V, T, 3, Second>::room(s), Recorder<V, T, First>::room(s), Recorder<V, T, Second>::room(s)});
 }
 
 }  // namespace
@@ -110,9 +129,17 @@ long pbfd_room(const pbfd_plan* p) {
   return long(register_bytes) * (wide > narrow ? wide : narrow);
 }
 
-void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<EnergyMomentum>(p, s, room); }
+void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<EnergyMomentum>>(p, s, room); }
 
-void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<ImplicitEuler>(p, s, room); }
+void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<ImplicitEuler>>(p, s, room); }
+
+void pbfd_start_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  make_by<Starting<EnergyMomentum>>(p, s, room);
+}
+
+void pbfd_start_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  make_by<Starting<ImplicitEuler>>(p, s, room);
+}
 
 void pbfd_energy_momentum_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   record_by<EnergyMomentum>(p, r, a, room);

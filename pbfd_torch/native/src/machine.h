@@ -105,7 +105,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const Stage problem = ways[i].problem();
     const Start start = ways[i].start();
     put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(scheme.share(trips[i].eased)));
-    for (int j = 0; j < plan.nv; j++) put(b.fitted[j], i, lane(plan.share[halvings * plan.nv + j], i));
+    for (int j = 0; j < plan.nv; j++)
+      put(b.fitted[j], i, Scheme::fits ? T(lane(plan.share[halvings * plan.nv + j], i)) : T(1));
     put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
     put(b.relaxed.length, i, T(problem.length)), put(b.relaxed.lagged, i, problem.lagged);
     put(newton.tolerance, i, T(ways[i].tolerance(rules.tolerance)));

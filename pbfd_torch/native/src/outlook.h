@@ -41,7 +41,7 @@ template <class V, class N, int D = 3> struct Outlook {
     count = limits = 0, base = slope = zero;
     per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt), relaxed = &b.relaxed;
     twists(plan, b.axes, d, twist);
-    drifts(plan, b.axes, d);
+    drifts(plan, b.axes, twist, d, drift);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) foresee(b.contacts, pair, i, where);
     });
@@ -127,30 +127,6 @@ template <class V, class N, int D = 3> struct Outlook {
     out.size = dot<D>(u, u), out.along = dot<D>(u, first);
     out.square = dot<D>(first, first) + dot<D>(u, second), out.cube = dot<D>(first, second);
     out.fourth = dot<D>(second, second);
-  }
-
-  // V̇ = Σ ṡ_i d_i, ṡ_i = ad(V_carrier) s_i, of all nodes.
-  void drifts(const Plan<N, D>& plan, const V* axes, const V* d) {
-    for (int k = 0; k < plan.nodes; k++) {
-      V carrier[S];
-      for (int a = 0; a < S; a++) {
-        carrier[a] = plan.parent[k] < 0 ? V(0) : twist[S * plan.parent[k] + a];
-        drift[S * k + a] = plan.parent[k] < 0 ? V(0) : drift[S * plan.parent[k] + a];
-      }
-      const int first = plan.v[k], last = first + freedoms(plan.kind[k]), rotation = plan.kind[k] == FREE ? first + 3 : first;
-      for (int j = first; j < rotation; j++) carrier[T + j - first] += d[j];  // its translation carries its rotation
-      for (int j = rotation; j < last; j++) {
-        const V* s = axes + S * j;
-        V moved[D], back[D];
-        swing<D>(carrier, s + T, moved), swing<D>(s, carrier + T, back);
-        for (int a = 0; a < D; a++) drift[S * k + T + a] = fma(d[j], moved[a] - back[a], drift[S * k + T + a]);
-        if constexpr (D == 3) {
-          V turned[3];
-          cross(carrier, s, turned);
-          for (int a = 0; a < 3; a++) drift[S * k + a] = fma(d[j], turned[a], drift[S * k + a]);
-        }
-      }
-    }
   }
 
   V of_contact(const Coming<V>& c, V a, V& df) const {
