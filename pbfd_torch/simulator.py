@@ -124,6 +124,12 @@ class Simulator(Generic[S]):
         """The step [s] as a tensor, which may carry derivatives."""
         return self.eager.step_size
 
+    @property
+    def roller(self) -> Callable[..., Rollout]:
+        """What makes rollouts, of the stepper and of others like it: a function that takes it first, and then what `rollout`
+        takes."""
+        return many_rolled_out if isinstance(self.stepper, NativeStepper) else rolled_out
+
     def sized(self, step_size: Tensor) -> Self:
         """The same simulator with steps [s] of another length `[]`, or of one for each world `[*batch]`."""
         return self._by(self.eager.sized(step_size))
@@ -206,10 +212,7 @@ class Simulator(Generic[S]):
         controls: `[steps, *batch, nu]`, or None for zero control; then `steps` says how many. progress: called after every step
         with the number of steps done; it may raise KeyboardInterrupt, which ends the rollout early and keeps what was computed.
         Raises `ContactOverflowError`, which holds the steps done, where the scene asks for it."""
-        stepper: Stepper[Any] = self.stepper
-        if isinstance(stepper, NativeStepper):
-            return many_rolled_out(stepper, state, controls, steps, progress)
-        return rolled_out(stepper, state, controls, steps, progress)
+        return self.roller(self.stepper, state, controls, steps, progress)
 
 
 @dataclass(frozen=True)

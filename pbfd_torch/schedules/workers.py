@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -18,16 +19,18 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.tensors.worlds import Worlds
 
 
 class Simulated(Protocol):
-    """What has a stepper: a `Simulator`."""
+    """What has a stepper, and knows how its rollouts are made: a `Simulator`."""
 
     @property
     def stepper(self) -> Stepper[Any]: ...
+
+    @property
+    def roller(self) -> Callable[..., Rollout]: ...
 
 
 class Workers:
@@ -58,7 +61,7 @@ class Workers:
         for index in torch.arange(worlds).tensor_split(self.count):
             part = Worlds((worlds,), index)
             held = None if controls is None else controls.expand(-1, worlds, -1)[:, index]
-            futures.append(self._pool.submit(rolled_out, simulator.stepper.take(part), state.take(part), held, steps))
+            futures.append(self._pool.submit(simulator.roller, simulator.stepper.take(part), state.take(part), held, steps))
         return _joined([future.result() for future in futures])
 
 
