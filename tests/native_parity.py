@@ -22,6 +22,10 @@ from pbfd_torch.tree.kinematics import difference
 DT = 0.01
 
 
+class OwnScheme(EnergyMomentum):
+    """A user's own, which the core cannot know."""
+
+
 def resting(q: Tensor, v: Tensor) -> Velocities:
     """A state that has felt nothing yet."""
     zero, nothing = torch.zeros_like(q[..., 0]), torch.zeros_like(v)

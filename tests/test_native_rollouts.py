@@ -10,12 +10,12 @@ from torch import Tensor
 
 from pbfd_torch import InputError, Simulator
 from pbfd_torch.bench.starts import scattered
-from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Native, Torch
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
+from tests.native_parity import OwnScheme
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -98,14 +98,14 @@ def test_an_interrupted_rollout_keeps_what_was_computed() -> None:
 def test_the_engine_is_a_choice_that_can_be_read() -> None:
     """Compiled where the core covers the steps; else in PyTorch, and why."""
     scene = SCENES["hopper"]().scene
-    compiled, uncovered = Simulator(scene, 0.008), Simulator(scene, 0.008, Bdf2())
+    compiled, uncovered = Simulator(scene, 0.008), Simulator(scene, 0.008, OwnScheme())
     assert (compiled.engine, compiled.engine_reason) == ("native", "")
     assert uncovered.engine == "torch"
-    assert "Bdf2" in uncovered.engine_reason
+    assert "integrator OwnScheme" in uncovered.engine_reason
     asked = Simulator(scene, 0.008, engine=Torch())
     assert (asked.engine, asked.engine_reason, asked.stepper) == ("torch", "", asked.eager)
-    with pytest.raises(InputError, match="Bdf2"):
-        Simulator(scene, 0.008, Bdf2(), engine=Native())
+    with pytest.raises(InputError, match="OwnScheme"):
+        Simulator(scene, 0.008, OwnScheme(), engine=Native())
     with pytest.raises(InputError, match="threads is 0: must be ≥ 1"):
         Native(threads=0)
     assert compiled.sized(torch.tensor(0.004, dtype=torch.float64)).engine == "native"

@@ -9,57 +9,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
+from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import State
-from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.calls import Calls, whole
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
+from pbfd_torch.native.schemes import ON_POSITIONS, Scheme
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
 
 COUNTED = ("status", "evaluations", "iterations", "hazards")
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
 
 
-@dataclass(frozen=True)
-class Scheme:
-    """An integrator that the core knows: its functions there, that of steps and that of starts, its states, and their fields:
-    coordinates `[*batch, nq]` first, those of degrees of freedom `[*batch, nv]`, and numbers `[*batch]`."""
-
-    function: str
-    start: str
-    state: type[State]
-    coordinates: tuple[str, ...]
-    freedoms: tuple[str, ...]
-    numbers: tuple[str, ...] = ()
-
-    def fields(self, state: State) -> dict[str, Tensor]:
-        """Those of a state, in the order of the core, all worlds one after the other."""
-        batch = tuple(state.q.shape[:-1])
-        vectors = self.coordinates + self.freedoms
-        given = {name: whole(x := getattr(state, name), (*batch, x.shape[-1])) for name in vectors}
-        return given | {name: whole(getattr(state, name), batch) for name in self.numbers}
-
-    def shapes(self, nq: int, nv: int) -> dict[str, tuple[int, ...]]:
-        """What the fields hold for each world."""
-        return dict.fromkeys(self.coordinates, (nq,)) | dict.fromkeys(self.freedoms, (nv,)) | dict.fromkeys(self.numbers, ())
-
-
-_ON_POSITIONS = Scheme("pbfd_implicit_euler", "pbfd_start_implicit_euler", Positions, ("q", "q_previous"), ("acceleration",))
-SCHEMES: dict[type, Scheme] = {
-    EnergyMomentum: Scheme(
-        *("pbfd_energy_momentum", "pbfd_start_energy_momentum", Velocities),
-        *(("q",), ("v", "push", "steady", "lag", "average"), ("gained", "surplus", "peak")),
-    ),
-    ImplicitEuler: _ON_POSITIONS,
-    Variational: _ON_POSITIONS,
-}
-
-
 class _Steps(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus", "share")),
+        *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus", "share", "jump")),
         *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
         ("given", ctypes.c_void_p * 10),
         ("control", ctypes.c_void_p),
@@ -75,12 +39,13 @@ class _Steps(ctypes.Structure):
 @dataclass(frozen=True)
 class Terms:
     """What is asked of steps. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; share: see `Variational`, 1 for
-    implicit Euler; evaluations: at most, of each with all that is tried."""
+    implicit Euler; jump: see `Bdf2`; evaluations: at most, of each with all that is tried."""
 
     dt: float
     tolerance: float
     surplus: float
     share: float
+    jump: float
     evaluations: int
 
 
@@ -110,7 +75,7 @@ class Journey:
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
-        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.share, terms.evaluations, self._worlds)
+        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.share, terms.jump, terms.evaluations, self._worlds)
         asked.last, asked.steps = self._worlds, self._steps
         asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
         asked.given[: len(self.given)] = [x.data_ptr() for x in self.given.values()]
@@ -140,7 +105,7 @@ class Core:
     def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
-        given = fields(self._scheme, self.plan, state)
+        given = self._scheme.fields(state, self.plan)
         journey = Journey(given, {name: _room_for(x, steps) for name, x in given.items()}, control, steps, self.plan.grip)
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
@@ -152,15 +117,14 @@ class Core:
         given = {"q": whole(q, q.shape), "v": whole(v, v.shape)}
         journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.grip)
         asked = journey.call(self._terms)
-        (_, *before), end = self._empty(_ON_POSITIONS, q).values(), self._empty(_ON_POSITIONS, q)
+        (_, *before), end = self._empty(ON_POSITIONS, q).values(), self._empty(ON_POSITIONS, q)
         asked.trial[:] = [x.data_ptr() for x in (*before, *end.values())]
         self._calls.share(self._scheme.start, asked, asked.worlds, asked.worlds // WORTH_A_BLOCK)
         return journey, end["q"]
 
     def _empty(self, scheme: Scheme, q: Tensor) -> dict[str, Tensor]:
         """Room for the fields of a state of worlds at q `[*batch, nq]`, its memory among them."""
-        _, nq, nv, _ = self.plan.sizes[:4]
-        shapes = scheme.shapes(nq, nv) | {"memory": (sum(self.plan.anchors), 3)}
+        shapes = scheme.shapes(self.plan) | {"memory": (sum(self.plan.anchors), 3)}
         return {name: q.new_empty((*q.shape[:-1], *shape)) for name, shape in shapes.items()}
 
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,19 +132,11 @@ class Core:
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(fields(self._scheme, self.plan, state), {}, held, (), self.plan.grip)
+        journey = Journey(self._scheme.fields(state, self.plan), {}, held, (), self.plan.grip)
         at, residual, jacobian = whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         self._calls.make("pbfd_balance", journey.call(self._terms), *addresses)
         return residual, jacobian
-
-
-def fields(scheme: Scheme, plan: Plan, state: State) -> dict[str, Tensor]:
-    """Those of a state that the core reads, its memory last, where there are anchors."""
-    given = scheme.fields(state)
-    if any(plan.anchors):
-        given["memory"] = whole(torch.cat(state.memory, -2), (*state.q.shape[:-1], sum(plan.anchors), 3))
-    return given
 
 
 def _room_for(given: Tensor, steps: tuple[int, ...]) -> Tensor:

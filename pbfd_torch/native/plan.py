@@ -9,11 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.aligned import aligned
+from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import Candidates, on_nodes
 from pbfd_torch.native.plane import Plane as MotionPlane
@@ -39,7 +41,8 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
     dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ. order: where
-    these are among those of all contact terms. anchors: how many each contact has, in the order of a state's memory."""
+    these are among those of all contact terms. anchors: how many each contact has, in the order of a state's memory. seats: where
+    links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -48,6 +51,7 @@ class Plan:
     grip: Tensor | None
     order: tuple[int, ...]
     anchors: tuple[int, ...]
+    seats: Seats
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -56,7 +60,7 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     _require_covered(stepper)
     a = aligned(stepper.articulation)
     known = _Terms(stepper, a)
-    held = known.pushed or not known.candidates.flat
+    held = known.pushed or not known.candidates.flat or isinstance(stepper.integrator, Bdf2)  # of which the core knows space only
     return _written(stepper, a, known, None if held else plane_of(a, [stepper.scene.gravity, *known.candidates.normals]))
 
 
@@ -99,7 +103,7 @@ def _written(stepper: EagerStepper[Any], a: Articulation, known: _Terms, plane: 
     dimension = 3 if plane is None else 2
     sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
     whole_numbers = torch.tensor(whole, dtype=torch.int32)
-    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, candidates.order, tuple(candidates.anchors))
+    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, candidates.order, tuple(candidates.anchors), Seats.of(a))
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:
@@ -107,7 +111,7 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     a, scene = stepper.articulation, stepper.scene
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
-    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler, Variational):
+    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler, Variational, Bdf2):
         raise unknown(f"integrator {type(stepper.integrator).__name__}")
     if stepper.step_size.ndim:
         raise unknown("a step of its own for each world")

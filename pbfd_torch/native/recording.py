@@ -11,10 +11,10 @@ from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.calls import Calls, whole
-from pbfd_torch.native.core import SCHEMES, fields
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan, planned_in_space
 from pbfd_torch.native.roster import CONTACT, rostered
+from pbfd_torch.native.schemes import SCHEMES
 from pbfd_torch.records.recording import assembled
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
@@ -61,7 +61,7 @@ class Writer(Generic[S]):
     def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
         """Of steps from the state before the first to those after each `[steps, *batch, …]`, in arrays of this length: the state
         after each, and its contacts if there is a `suspect`; `hazards` are there already."""
-        given, found = (fields(self._scheme, self._plan, x) for x in (before, states))
+        given, found = (self._scheme.fields(x, self._plan) for x in (before, states))
         batch = tuple(before.q.shape[:-1])
         worlds, steps = math.prod(batch), math.prod(states.q.shape[:-1])
         asked = _Record(self.dt, worlds, 0, steps)

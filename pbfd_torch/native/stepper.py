@@ -12,15 +12,17 @@ from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import InputError
+from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import Integrator, S, fresh
 from pbfd_torch.integrators.variational import Variational
-from pbfd_torch.native.core import SCHEMES, Core, Journey, Terms
+from pbfd_torch.native.core import Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError
 from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.native.recording import Record, Writer
+from pbfd_torch.native.schemes import SCHEMES, Scheme
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
@@ -49,8 +51,10 @@ class NativeStepper(Generic[S]):
         surplus = scheme.surplus if isinstance(scheme, EnergyMomentum) else math.inf
         tolerance = Fallbacks().direct.tolerance_for(eager.articulation.dtype)
         share = scheme.share if isinstance(scheme, Variational) else 1.0
-        terms = Terms(eager.dt, tolerance, surplus, share, eager.evaluations)
-        self._core = Core(compiled, plan, SCHEMES[type(scheme)], terms, self.threads)
+        jump = scheme.jump if isinstance(scheme, Bdf2) else math.inf
+        terms = Terms(eager.dt, tolerance, surplus, share, jump, eager.evaluations)
+        self._scheme: Scheme = SCHEMES[type(scheme)]
+        self._core = Core(compiled, plan, self._scheme, terms, self.threads)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads the core itself."""
@@ -91,8 +95,8 @@ class NativeStepper(Generic[S]):
         batch = q.shape[:-1]
         controls = q.new_zeros(1, self.scene.nu) if control is None else control[None]
         journey, _ = self._core.start(q, v, spread(controls, batch))
-        fields = fresh(q) | journey.found | {"memory": blank_memory(self.scene.terms, tuple(batch))}
-        return cast(S, SCHEMES[type(self.integrator)].state(**fields))
+        found = self._scheme.restored(journey.found, self._core.plan)
+        return cast(S, self._scheme.state(**fresh(q) | found | {"memory": blank_memory(self.scene.terms, tuple(batch))}))
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
@@ -115,7 +119,7 @@ class NativeStepper(Generic[S]):
 
     def _after(self, state: S, journey: Journey, time: Tensor) -> S:
         """The states after steps from a state, at these times."""
-        found, anchors = journey.found, self._core.plan.anchors
+        anchors, found = self._core.plan.anchors, self._scheme.restored(journey.found, self._core.plan)
         memory = state.memory
         if any(anchors):
             memory = found["memory"].split(anchors, -2)

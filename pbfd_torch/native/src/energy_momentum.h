@@ -53,7 +53,7 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
   }
 
   // What is fixed in the step from a state, and where it may end.
-  void begin(Balance<V, N, D>& b, const State& before, V* guess) {
+  void begin(Balance<V, N, D>& b, const State& before, V* guess, M) {
     begin_energy_momentum(b, before.q, before.v, room_to_begin);
     retract(plan, before.q, before.average, b.dt, guess);
   }
@@ -86,10 +86,10 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
 
   // From the state before to that after a step that ended at q, where `b` has been evaluated; which lanes refuse it. Where inertia
   // works at the end of the step, the state after it has the step's average velocity, and what the forces that are not early give.
-  M advance(Balance<V, N, D>& b, const V* q, const State& before, State& after) {
+  M advance(Balance<V, N, D>& b, const V* q, const State& before, State& after, M eased) {
     const int n = plan.nv;
     const V h = b.dt, per = V(1) / h, zero(0), half(0.5);
-    const M on_chord = b.share < V(1);
+    const M on_chord = !eased;
     forces_by_share(b, q, rough, smooth, other);
     difference(plan, b.q_start, q, after.average);
     for (int i = 0; i < n; i++) after.average[i] = per * after.average[i];

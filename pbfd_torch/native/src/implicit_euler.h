@@ -56,7 +56,7 @@ template <class V, class N, int D> struct ImplicitEuler {
   }
 
   // What is fixed in the step from a state, and where it may end.
-  void begin(Balance<V, N, D>& b, const State& before, V* guess) {
+  void begin(Balance<V, N, D>& b, const State& before, V* guess, M) {
     for (int i = 0; i < plan.nq; i++) b.q_start[i] = before.q[i];
     place(plan, before.q, b.start, b.start_axes), place(plan, before.q_previous, earlier, axes);
     b.weight = V(1) / (b.dt * b.dt);
@@ -79,7 +79,7 @@ template <class V, class N, int D> struct ImplicitEuler {
   }
 
   // From the state before to that after a step that ended at q; no lane refuses it.
-  M advance(Balance<V, N, D>& b, const V* q, const State& before, State& after) {
+  M advance(Balance<V, N, D>& b, const V* q, const State& before, State& after, M) {
     difference(plan, before.q_previous, before.q, moved);
     difference(plan, before.q, q, gained);
     for (int i = 0; i < plan.nv; i++) gained[i] = (gained[i] - moved[i]) / b.dt;

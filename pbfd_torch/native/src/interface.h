@@ -21,7 +21,7 @@ struct pbfd_plan {
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
 //   given: of the state that each world goes on from: q, v, push, steady, lag, average, gained, surplus, peak (`Velocities`), or q,
-//     q_previous, acceleration (`Positions`); and behind, [3 · anchors] of its memory, where there are any;
+//     q_previous, acceleration (`Positions`), or q, history, moves, push (`FourPoses`); and behind, [3 · anchors] of its memory, where there are any;
 //   control: [worlds, nu] for all steps if `held`, else [steps, worlds, nu];
 //   found: what is given, after each step, [steps, …];
 //   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].
@@ -29,6 +29,7 @@ struct pbfd_steps {
   double dt, tolerance;
   double surplus;  // of energy–momentum
   double share;    // of the chord at which inertia works: 1 implicit Euler, less the variational scheme
+  double jump;     // of BDF2 [weights]
   int evaluations;  // at most, of each world in each step, with all that is tried
   int worlds, first, last;
   int steps, held;
@@ -50,10 +51,12 @@ PBFD_FUNCTION long pbfd_room(const pbfd_plan*);
 // Steps by Newton's method with all fallbacks.
 PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
+PBFD_FUNCTION void pbfd_bdf2(const pbfd_plan*, const pbfd_steps*, void* room);  // in space only
 
 // States at t = 0 of worlds that are given by q, v and one control, found as after one step. What is reported is the trial step.
 PBFD_FUNCTION void pbfd_start_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_start_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
+PBFD_FUNCTION void pbfd_start_bdf2(const pbfd_plan*, const pbfd_steps*, void* room);
 
 // What a record lists beside what a plan in space knows.
 //   carrier: node of each link, −1: it rides on the world; frame: [links, 12] rotation and position, row by row, of the links there;
@@ -87,6 +90,7 @@ struct pbfd_record {
 
 PBFD_FUNCTION void pbfd_energy_momentum_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);
 PBFD_FUNCTION void pbfd_implicit_euler_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);
+PBFD_FUNCTION void pbfd_bdf2_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);
 
 // The balance of forces that energy–momentum steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
 // J [worlds, nv · nv].

@@ -27,7 +27,7 @@ template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* gi
           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
 }
 
-Rules rules(const pbfd_plan* p, const pbfd_steps* s) { return {s->dt, s->tolerance, s->surplus, s->share, p->halvings, s->evaluations}; }
+Rules rules(const pbfd_plan* p, const pbfd_steps* s) { return {s->dt, s->tolerance, s->surplus, s->share, s->jump, p->halvings, s->evaluations}; }
 
 // Steps of a scheme, and starts.
 template <template <class, class, int> class Scheme> struct Going {
@@ -71,12 +71,15 @@ template <class What, class T, int D> void make_of(const pbfd_plan* p, const pbf
     What::make(plan, p, s, Arena<Several>{static_cast<Several*>(room)});
 }
 
+template <class What> void in_space(const pbfd_plan* p, const pbfd_steps* s, void* room) {
+  p->bytes == 8 ? make_of<What, double, 3>(p, s, room) : make_of<What, float, 3>(p, s, room);
+}
+
 template <class What> void make_by(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  const bool plane = p->dimension == 2;
-  if (p->bytes == 8)
-    plane ? make_of<What, double, 2>(p, s, room) : make_of<What, double, 3>(p, s, room);
+  if (p->dimension == 3)
+    in_space<What>(p, s, room);
   else
-    plane ? make_of<What, float, 2>(p, s, room) : make_of<What, float, 3>(p, s, room);
+    p->bytes == 8 ? make_of<What, double, 2>(p, s, room) : make_of<What, float, 2>(p, s, room);
 }
 
 template <template <class, class, int> class Scheme, class T>
@@ -107,8 +110,10 @@ template <class V> int room_of(Sizes s) {
   using T = typename Kind<V>::Scalar;
   using First = EnergyMomentum<V, T, 3>;
   using Second = ImplicitEuler<V, T, 3>;
-  return std::max({Machine<V, T, 3, First>::room(s), Machine<V, T, 3, Second>::room(s), Starts<V, T, 3, First>::room(s),
-                   Starts<V, T, 3, Second>::room(s), Recorder<V, T, First>::room(s), Recorder<V, T, Second>::room(s)});
+  using Third = Bdf2<V, T, 3>;
+  return std::max({Machine<V, T, 3, First>::room(s), Machine<V, T, 3, Second>::room(s), Machine<V, T, 3, Third>::room(s),
+                   Starts<V, T, 3, First>::room(s), Starts<V, T, 3, Second>::room(s), Starts<V, T, 3, Third>::room(s),
+                   Recorder<V, T, First>::room(s), Recorder<V, T, Second>::room(s), Recorder<V, T, Third>::room(s)});
 }
 
 }  // namespace
@@ -133,6 +138,8 @@ void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
 
 void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<ImplicitEuler>>(p, s, room); }
 
+void pbfd_bdf2(const pbfd_plan* p, const pbfd_steps* s, void* room) { in_space<Going<Bdf2>>(p, s, room); }
+
 void pbfd_start_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   make_by<Starting<EnergyMomentum>>(p, s, room);
 }
@@ -141,6 +148,8 @@ void pbfd_start_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* ro
   make_by<Starting<ImplicitEuler>>(p, s, room);
 }
 
+void pbfd_start_bdf2(const pbfd_plan* p, const pbfd_steps* s, void* room) { in_space<Starting<Bdf2>>(p, s, room); }
+
 void pbfd_energy_momentum_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   record_by<EnergyMomentum>(p, r, a, room);
 }
@@ -148,6 +157,8 @@ void pbfd_energy_momentum_record(const pbfd_plan* p, const pbfd_roster* r, const
 void pbfd_implicit_euler_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   record_by<ImplicitEuler>(p, r, a, room);
 }
+
+void pbfd_bdf2_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) { record_by<Bdf2>(p, r, a, room); }
 
 void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   const bool plane = p->dimension == 2;

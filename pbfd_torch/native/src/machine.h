@@ -1,6 +1,7 @@
 // The lane machine: every pass makes one evaluation for all lanes, each at its own place of its own step and all that it tries, and
 // a lane that has ended its step takes the next one of its world, or another world, at once (the paper's Fig. 3).
 #pragma once
+#include "bdf2.h"
 #include "energy_momentum.h"
 #include "implicit_euler.h"
 #include "itinerary.h"
@@ -49,7 +50,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void run(const Journey<T>& to, const Rules& asked, int first, int last) {
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = M(false);
+    newton.running = eased = M(false);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     while (any_aboard()) {
@@ -70,6 +71,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   Itinerary<T> trips[W];
   Fallbacks<T> ways[W];
   bool plainly[W];  // it is posed the step itself
+  M eased;          // it is posed an easier step
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
@@ -104,7 +106,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const int halvings = trips[i].halvings;
     const Stage problem = ways[i].problem();
     const Start start = ways[i].start();
-    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(scheme.share(trips[i].eased)));
+    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(scheme.share(trips[i].eased))), put(eased, i, trips[i].eased > 0);
     for (int j = 0; j < plan.nv; j++)
       put(b.fitted[j], i, Scheme::fits ? T(lane(plan.share[halvings * plan.nv + j], i)) : T(1));
     put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
@@ -137,7 +139,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     Balance<V, N, D>& b = newton.balance;
     scheme.velocity(before, b.dt, velocity);
     const M fits = near(before.q, plan.nq) & slow(plan, velocity, b.dt) & finite(b.control, plan.nu);
-    scheme.begin(b, before, guess);
+    scheme.begin(b, before, guess, eased);
     if (any(b.relaxed.length < V(1))) shorten();
     b.begin();
     for (int i = 0; i < plan.nq; i++) {
@@ -210,7 +212,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   M conclude(M over) {
     Balance<V, N, D>& b = newton.balance;
     if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
-    const M refused = scheme.advance(b, newton.q, before, after);
+    const M refused = scheme.advance(b, newton.q, before, after, eased);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
     if (plan.anchors > 0) b.contacts.remember(after.behind);
     M deep, far, kept(false), solved(false), failed(false), part(false), lost(false);

@@ -161,7 +161,7 @@ template <class V, class N, class Scheme> struct Recorder {
   // The contacts at the end of the step, and what is deepest beyond its measure.
   void write_step() {
     Contacts<V, N, D>& contacts = balance.contacts;
-    scheme.begin(balance, before, guess);
+    scheme.begin(balance, before, guess, M(false));
     contacts.begin(balance.start, balance.target, balance.dt);
     V worst = V(roster.still_strain[0]), number = V(N(roster.still_suspect));
     auto strained = [&](V share, int danger) {  // of those strained alike, the first

@@ -82,7 +82,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
     V *abrupt = rough, *others = smooth, *by_abrupt = spare, *by_others = acceleration;
     b.share = V(1);
     for (int i = 0; i < plan.nv; i++) b.fitted[i] = V(1);
-    machine.scheme.begin(b, before, machine.guess);
+    machine.scheme.begin(b, before, machine.guess, M(false));
     b.begin();
     place(plan, end, b.now, b.axes);
     forces_by_onset(b, end, abrupt, others, spare);
@@ -131,6 +131,28 @@ template <class V, class N, int D, class Scheme> struct Starts {
       out.acceleration[i] = acceleration[i], sum[i] = fma(V(0.5) * dt * dt, acceleration[i], -(dt * v[i]));
     for (int i = 0; i < plan.nq; i++) out.q[i] = before.q[i];
     retract(plan, before.q, sum, V(1), out.q_previous);
+  }
+
+  // A past of constant acceleration; how hard things pushed is not known.
+  void complete(M, FourPoses<V>& out) {
+    using BDF2 = Bdf2<V, N, D>;
+    const Poses<V> at = balance.start;
+    const V dt = balance.dt, *gained = rates(acceleration);
+    V* curved = room_to_begin;
+    for (int i = 0; i < 12 * plan.nodes; i++) curved[i] = gained[i];
+    twists(plan, balance.start_axes, v, momenta.twist), drifts(plan, balance.start_axes, momenta.twist, v, drift);
+    for (int k = 0; k < plan.nodes; k++) {
+      V bent[12];
+      pose_acceleration<D>(k, at, momenta.twist, drift, bent);
+      for (int i = 0; i < 12; i++) curved[12 * k + i] += bent[i];
+    }
+    const V* speed = rates(v);
+    for (int i = 0; i < plan.nq; i++) out.q[i] = before.q[i];
+    for (int k = 0; k < plan.nodes; k++)
+      for (int i = 0; i < 12; i++)
+        BDF2::remember(plan, M(true), k, i, BDF2::entry(at, k, i), speed[12 * k + i], curved[12 * k + i], dt, out);
+    for (int i = 0; i < plan.nv; i++) BDF2::remember(plan, M(true), i, v[i], acceleration[i], dt, out);
+    out.push[0] = infinite<V>() - infinite<V>();
   }
 
   // With what rough forces give in the trial, unless that is an impact, and with what smooth ones are late by.

@@ -6,7 +6,8 @@
 namespace pbfd {
 
 struct Rules {
-  double dt, tolerance, surplus, share;  // [s], of ‖r/scale‖, see `EnergyMomentum`, see `Variational`
+  double dt, tolerance;         // [s], of ‖r/scale‖
+  double surplus, share, jump;  // see `EnergyMomentum`, `Variational`, `Bdf2`
   int halvings, evaluations;      // how often a step may be halved; at most, with all that is tried
 };
 

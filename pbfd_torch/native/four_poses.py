@@ -1,0 +1,50 @@
+"""What BDF2 remembers, as the core has it: the poses of nodes, side by side, where the reference has those of links."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.tree.articulation import Articulation
+
+ENTRIES = 12  # of a pose: rotation and position
+
+
+@dataclass(frozen=True, eq=False)
+class Seats:
+    """Where links are on nodes.
+
+    Attributes:
+        node: `[nlink]` of each link, 0: the world.
+        frame: `[nlink, 4, 4]` of each link on its node.
+        link: `[nodes]` a link on each node; one without links moves nothing, and has any.
+    """
+
+    node: Tensor
+    frame: Tensor
+    link: Tensor
+
+    @staticmethod
+    def of(a: Articulation) -> Seats:
+        """Of a tree, as `aligned` gives it."""
+        node = list(a.topology.link_node)
+        link = [node.index(k) if k in node else 0 for k in range(1, a.topology.njoint + 1)]
+        return Seats(torch.tensor(node), a.link_frame, torch.tensor(link))
+
+    def of_nodes(self, history: Sequence[Tensor]) -> Tensor:
+        """Poses of all links, each `[*batch, nlink, 4, 4]`, as those of the nodes, `[*batch, len(history) · nodes · ENTRIES]`."""
+        links = torch.stack(tuple(history), -4)[..., self.link, :, :]
+        poses = links @ torch.linalg.inv(self.frame)[self.link]
+        return torch.cat((poses[..., :3, :3].flatten(-2), poses[..., :3, 3]), -1).flatten(-3)
+
+    def of_links(self, history: Tensor, count: int) -> tuple[Tensor, ...]:
+        """The same back: `count` times the poses of all links."""
+        entries = history.unflatten(-1, (count, len(self.link), ENTRIES))
+        nodes = torch.cat((entries[..., :9].unflatten(-1, (3, 3)), entries[..., 9:, None]), -1)
+        world = torch.eye(4, dtype=nodes.dtype)[:3].expand(*nodes.shape[:-3], 1, 3, 4)
+        nodes = torch.cat((world, nodes), -3)
+        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=nodes.dtype).expand(*nodes.shape[:-2], 1, 4)
+        return (torch.cat((nodes, last), -2)[..., self.node, :, :] @ self.frame).unbind(-4)
