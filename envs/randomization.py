@@ -90,16 +90,15 @@ class DrawnWorlds:
 
     def simulator(self, factors: Tensor, push: Tensor) -> Simulator[Any]:
         """Of worlds with these factors of mass, friction and gain `[worlds, 3]` and pushes `[worlds, 3]` [N]."""
-        a = self._scene.articulation
+        a = self._scene.articulation  # checked with the friction, while it is one for all worlds
         mass, friction, gain = factors.to(a.dtype).unbind(-1)
         links = torch.nn.functional.pad(push.to(a.dtype)[:, None], (0, 0, 0, a.nlink - 1))
+        scene = with_parameters(self._scene, {name: value * friction[:, None] for name, value in self._friction.items()})
         terms: list[Term] = []
-        for term in self._scene.terms:
+        for term in scene.terms:
             if isinstance(term, Actuators):
                 terms.append(replaced(term, gear=term.gear * gain[:, None]))
             else:
                 terms.append(replaced(term, force=links) if isinstance(term, Pushes) else term)
         scaled = replaced(a, pseudo_inertia=a.pseudo_inertia * mass[:, None, None, None])
-        scene = replaced(self._scene, articulation=scaled, terms=tuple(terms))
-        scene = with_parameters(scene, {name: value * friction[:, None] for name, value in self._friction.items()})
-        return self._simulator.with_scene(scene)
+        return self._simulator.with_scene(replaced(scene, articulation=scaled, terms=tuple(terms)))

@@ -65,8 +65,8 @@ class Simulator(Generic[S]):
 
     def _stepping(self) -> tuple[Stepper[S], str, str]:
         if self._made is None:
-            engine, reason = (self._engine, "") if self._engine is not None else chosen(self.eager)
-            self._made = engine.stepper(self.eager), engine.name, reason
+            engine = self._engine
+            self._made = chosen(self.eager) if engine is None else (engine.stepper(self.eager), engine.name, "")
         return self._made
 
     def _carriers(self) -> Carriers:

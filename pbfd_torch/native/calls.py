@@ -24,11 +24,10 @@ class _Plan(ctypes.Structure):
             (name, ctypes.c_int)
             for name in (
                 *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
-                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes"),
+                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes", "varied"),
             )
         ),
-        ("whole", ctypes.c_void_p),
-        ("real", ctypes.c_void_p),
+        *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),
     )
 
 
@@ -47,7 +46,8 @@ class Calls:
     def __init__(self, library: Library, plan: Plan, threads: int) -> None:
         self._kept, self._threads = plan, threads  # the library reads the plan's numbers where they are
         self._functions = library.functions
-        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, plan.whole.data_ptr(), plan.real.data_ptr())
+        tables = (x.data_ptr() for x in (plan.whole, plan.real, plan.sample, plan.which))
+        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, len(plan.which), *tables)
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), len(plan.real)):
             raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")

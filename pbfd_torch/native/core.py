@@ -31,7 +31,7 @@ class _Steps(ctypes.Structure):
         ("residual_norm", ctypes.c_void_p),
         ("counted", ctypes.c_void_p * len(COUNTED)),
         ("fallbacks", ctypes.c_void_p),
-        ("grip", ctypes.c_void_p),
+        ("own", ctypes.c_void_p),
         ("trial", ctypes.c_void_p * 7),
     )
 
@@ -54,19 +54,19 @@ class Journey:
 
     Attributes:
         given: what each world sets out from, `[*batch, ...]`, q first.
-        control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. grip: see `Plan`.
+        control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. own: see `Plan`.
         found: what it has after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
         residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
     """
 
     def __init__(
-        self, given: dict[str, Tensor], found: dict[str, Tensor], control: Tensor, steps: tuple[int, ...], grip: Tensor | None
+        self, given: dict[str, Tensor], found: dict[str, Tensor], control: Tensor, steps: tuple[int, ...], own: Tensor
     ) -> None:
         self.given, self.found = given, found
         batch = tuple(given["q"].shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
         self.control = whole(control, (len(control), *batch, control.shape[-1]))
-        self.grip = None if grip is None else whole(grip, (*batch, grip.shape[-1]))
+        self.own = whole(own, (*batch, own.shape[-1]))
         self.residual_norm = control.new_empty((*steps, *batch))
         first, *others = COUNTED
         self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
@@ -82,8 +82,7 @@ class Journey:
         asked.found[: len(self.found)] = [x.data_ptr() for x in self.found.values()]
         asked.counted[:] = [x.data_ptr() for x in self.counted.values()]
         asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
-        if self.grip is not None:
-            asked.grip = self.grip.data_ptr()
+        asked.own = self.own.data_ptr()
         return asked
 
     @property
@@ -106,7 +105,7 @@ class Core:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
         given = self._scheme.fields(state, self.plan)
-        journey = Journey(given, {name: _room_for(x, steps) for name, x in given.items()}, control, steps, self.plan.grip)
+        journey = Journey(given, {name: _room_for(x, steps) for name, x in given.items()}, control, steps, self.plan.own)
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
@@ -115,7 +114,7 @@ class Core:
         """The fields of the states at t = 0 of all worlds at q `[*batch, nq]` with v `[*batch, nv]` under a control `[1, *batch,
         nu]`, and how their trial steps were solved; and where these have ended, `[*batch, nq]`."""
         given = {"q": whole(q, q.shape), "v": whole(v, v.shape)}
-        journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.grip)
+        journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.own)
         asked = journey.call(self._terms)
         (_, *before), end = self._empty(ON_POSITIONS, q).values(), self._empty(ON_POSITIONS, q)
         asked.trial[:] = [x.data_ptr() for x in (*before, *end.values())]
@@ -132,7 +131,7 @@ class Core:
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(self._scheme.fields(state, self.plan), {}, held, (), self.plan.grip)
+        journey = Journey(self._scheme.fields(state, self.plan), {}, held, (), self.plan.own)
         at, residual, jacobian = whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         self._calls.make("pbfd_balance", journey.call(self._terms), *addresses)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.native.stepper import NativeStepper, uncovered
+from pbfd_torch.native.not_compiled import NotCompiledError
+from pbfd_torch.native.stepper import NativeStepper, plan_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import Stepper
 
@@ -50,7 +51,10 @@ class Native:
         return NativeStepper(eager, self.threads)
 
 
-def chosen(eager: EagerStepper[Any]) -> tuple[Engine, str]:
-    """The engine for these steps, and why it is not the compiled core (empty where it is)."""
-    missing = uncovered(eager)
-    return (Torch(), missing) if missing else (Native(), "")
+def chosen(eager: EagerStepper[Any]) -> tuple[Stepper[Any], str, str]:
+    """What makes these steps, the engine's name, and why it is not the compiled core (empty where it is)."""
+    try:
+        plan = plan_of(eager)
+    except NotCompiledError as missing:
+        return eager, Torch.name, str(missing)
+    return NativeStepper(eager, plan=plan), Native.name, ""

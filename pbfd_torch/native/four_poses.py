@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.articulation import Articulation
 
 ENTRIES = 12  # of a pose: rotation and position
@@ -19,7 +20,7 @@ class Seats:
 
     Attributes:
         node: `[nlink]` of each link, 0: the world.
-        frame: `[nlink, 4, 4]` of each link on its node.
+        frame: `[*, nlink, 4, 4]` of each link on its node.
         link: `[nodes]` a link on each node; one without links moves nothing, and has any.
     """
 
@@ -34,10 +35,14 @@ class Seats:
         link = [node.index(k) if k in node else 0 for k in range(1, a.topology.njoint + 1)]
         return Seats(torch.tensor(node), a.link_frame, torch.tensor(link))
 
+    def take(self, worlds: Worlds) -> Seats:
+        """Those of some worlds."""
+        return replaced(self, frame=worlds.pick(self.frame, 3))
+
     def of_nodes(self, history: Sequence[Tensor]) -> Tensor:
         """Poses of all links, each `[*batch, nlink, 4, 4]`, as those of the nodes, `[*batch, len(history) · nodes · ENTRIES]`."""
         links = torch.stack(tuple(history), -4)[..., self.link, :, :]
-        poses = links @ torch.linalg.inv(self.frame)[self.link]
+        poses = links @ torch.linalg.inv(self.frame)[..., None, self.link, :, :]
         return torch.cat((poses[..., :3, :3].flatten(-2), poses[..., :3, 3]), -1).flatten(-3)
 
     def of_links(self, history: Tensor, count: int) -> tuple[Tensor, ...]:
@@ -47,4 +52,4 @@ class Seats:
         world = torch.eye(4, dtype=nodes.dtype)[:3].expand(*nodes.shape[:-3], 1, 3, 4)
         nodes = torch.cat((world, nodes), -3)
         last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=nodes.dtype).expand(*nodes.shape[:-2], 1, 4)
-        return (torch.cat((nodes, last), -2)[..., self.node, :, :] @ self.frame).unbind(-4)
+        return (torch.cat((nodes, last), -2)[..., self.node, :, :] @ self.frame[..., None, :, :, :]).unbind(-4)

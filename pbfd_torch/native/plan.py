@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,7 @@ from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import SHORTEST_STEP
+from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -39,19 +41,27 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype.
-    dimension: 2 where all moves in a plane. grip: μ of the candidates `[*batch, candidates]`, where worlds differ. order: where
-    these are among those of all contact terms. anchors: how many each contact has, in the order of a state's memory. seats: where
-    links are on the nodes."""
+    """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
+    `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
+    dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their μ: the core knows these in space only,
+    and not with BDF2. order: where the candidates are among those of all contact terms. anchors: how many
+    each contact has, in the order of a state's memory. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
     real: Tensor
+    which: Tensor
+    own: Tensor
+    sample: Tensor
     dimension: int
-    grip: Tensor | None
+    apart: bool
     order: tuple[int, ...]
     anchors: tuple[int, ...]
     seats: Seats
+
+    def take(self, worlds: Worlds) -> Plan:
+        """The plan of some worlds, to the bit."""
+        return replaced(self, own=worlds.pick(self.own, 1), seats=self.seats.take(worlds))
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -61,7 +71,11 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     a = aligned(stepper.articulation)
     known = _Terms(stepper, a)
     held = known.pushed or not known.candidates.flat or isinstance(stepper.integrator, Bdf2)  # of which the core knows space only
-    return _written(stepper, a, known, None if held else plane_of(a, [stepper.scene.gravity, *known.candidates.normals]))
+    space = _written(stepper, a, known, None)
+    if space.apart and isinstance(stepper.integrator, Bdf2):
+        raise unknown("BDF2 of worlds that differ")
+    plane = None if held or space.apart else plane_of(a, [stepper.scene.gravity, *known.candidates.normals])
+    return space if plane is None else _written(stepper, a, known, plane)
 
 
 def planned_in_space(stepper: EagerStepper[Any]) -> Plan:
@@ -87,28 +101,44 @@ def _written(stepper: EagerStepper[Any], a: Articulation, known: _Terms, plane: 
         ranges = [*act.control_range.unbind(-1), *act.force_range.unbind(-1)]
         driven = [act.gear, act.gain, act.bias, act.stiffness, act.damping, *ranges]
     whole += candidates.whole() + known.pushed
-    scale = force_scale(a, 1.0).expand(t.nv)
     shares = _shares(stepper, known.share)
     speeds = [known.limit_release, known.limit_per_force, known.dry_speed]
     real = [
-        *nodes,
-        *(stepper.scale.expand(t.nv), scale, t.turns.to(a.dtype), *shares, known.spring, known.damping, known.armature),
-        *(known.dry, a.lower, a.upper, known.limit, known.rest),
+        *(x.flatten(-rank) for x, rank in zip(nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True)),
+        *(_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), *shares),
+        *(known.spring, known.damping, known.armature, known.dry, a.lower, a.upper, known.limit, known.rest),
         *driven,
-        *(gravity, reach(a), a.rest.new_tensor(speeds)),
+        *(gravity, reach(a)[..., None], a.rest.new_tensor(speeds)),
         *candidates.real(),
-        *(x[k] for k in range(2) for x in known.pushes),
+        *(x[k].flatten(-2) for k in range(2) for x in known.pushes),
     ]
-    flat = torch.cat([torch.as_tensor(x, dtype=a.dtype).reshape(-1) for x in real]).contiguous()
-    dimension = 3 if plane is None else 2
     sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
-    whole_numbers = torch.tensor(whole, dtype=torch.int32)
-    return Plan(sizes, whole_numbers, flat, dimension, candidates.grip, candidates.order, tuple(candidates.anchors), Seats.of(a))
+    sample = torch.cat([a.rest.new_empty(0), *candidates.samples])
+    grips = {id(x) for x in candidates.grips}
+    apart = any(x.ndim > 1 and id(x) not in grips for x in real)
+    told = (*_told_apart(real), sample, 3 if plane is None else 2, apart)
+    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), *told, candidates.order, tuple(candidates.anchors), Seats.of(a))
+
+
+def _told_apart(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Numbers `[n]` that all worlds have, or `[*batch, n]` in pieces, one after the other: of all or of one world, which of them
+    the worlds have of their own, and these."""
+    ends = list(itertools.accumulate(x.shape[-1] for x in pieces))
+    some = [(x, range(end - x.shape[-1], end)) for x, end in zip(pieces, ends, strict=True) if x.ndim > 1]
+    batch = torch.broadcast_shapes(*(x.shape[:-1] for x, _ in some))
+    own = torch.cat([pieces[0].new_empty(*batch, 0), *(x.expand(*batch, -1) for x, _ in some)], -1)
+    first = [x if x.ndim == 1 else x.flatten(0, -2)[0] for x in pieces]
+    return torch.cat(first), torch.tensor([i for _, places in some for i in places], dtype=torch.int32), own
+
+
+def _each(values: Tensor, count: int) -> Tensor:
+    """One number for each of so many, given for all of them or for each, `[*, count]`."""
+    return values.expand(*values.shape[:-1], count)
 
 
 def _require_covered(stepper: EagerStepper[Any]) -> None:
     """Raises `NotCompiledError` for what is not the terms' affair."""
-    a, scene = stepper.articulation, stepper.scene
+    a = stepper.articulation
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
     if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler, Variational, Bdf2):
@@ -117,14 +147,8 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
         raise unknown("a step of its own for each world")
     if not isinstance(stepper.evaluations, int):
         raise unknown("evaluations of its own for each world")
-    for what in ("joint_frame", "joint_axis", "joint_ref", "link_frame", "pseudo_inertia", "lower", "upper"):
-        if getattr(a, what).ndim != {"joint_ref": 1, "lower": 1, "upper": 1, "joint_axis": 2}.get(what, 3):
-            raise unknown(f"{what} of its own for each world")
-    if scene.gravity.ndim != 1:
-        raise unknown("gravity of its own for each world")
     free = [j for j, size in enumerate(a.topology.joint_sizes) if size == (7, 6)]
-    eye = torch.eye(4, dtype=a.dtype)
-    if any(not torch.equal(a.joint_frame[j], eye) for j in free):
+    if not bool((a.joint_frame[..., free, :, :] == torch.eye(4, dtype=a.dtype)).all()):
         raise unknown("a free joint that does not move along the world's axes")
 
 
@@ -141,9 +165,9 @@ def _shares(stepper: EagerStepper[Any], share: Tensor) -> list[Tensor]:
 
 
 def _plain(frames: Tensor) -> list[int]:
-    """Which nodes' frames are turned as their parents'."""
-    eye = torch.eye(frames.shape[-1], dtype=frames.dtype)
-    return [int(torch.equal(frame, eye)) for frame in frames]
+    """Which nodes' frames are turned as their parents', in all worlds."""
+    same = (frames == torch.eye(frames.shape[-1], dtype=frames.dtype)).flatten(-2).all(-1)
+    return same.reshape(-1, same.shape[-1]).all(0).int().tolist()
 
 
 def _above(a: Articulation) -> list[int]:
@@ -161,19 +185,20 @@ def _nodes(a: Articulation) -> Sequence[Tensor]:
     """Frames, origins, references and senses of the joints, masses, centres and second moments of all links that ride on each, and
     the mass that it moves."""
     t = a.topology
-    ridden = torch.zeros(t.njoint, 4, 4, dtype=a.dtype)
+    each = a.link_frame @ a.pseudo_inertia @ a.link_frame.mT
+    ridden = each.new_zeros(*each.shape[:-3], t.njoint, 4, 4)
     for link, node in enumerate(t.link_node):
         if node > 0:  # what rides on the world does not move
-            ridden[node - 1] += a.link_frame[link] @ a.pseudo_inertia[link] @ a.link_frame[link].mT
-    mass, first = ridden[:, 3, 3], ridden[:, :3, 3]
-    center = torch.where(mass[:, None] > 0, first / torch.where(mass > 0, mass, 1.0)[:, None], 0.0)
-    second = ridden[:, :3, :3] - mass[:, None, None] * center[:, :, None] * center[:, None, :]
+            ridden[..., node - 1, :, :] += each[..., link, :, :]
+    mass, first = ridden[..., 3, 3], ridden[..., :3, 3]
+    center = torch.where(mass[..., None] > 0, first / torch.where(mass > 0, mass, 1.0)[..., None], 0.0)
+    second = ridden[..., :3, :3] - mass[..., None, None] * center[..., :, None] * center[..., None, :]
     carried = mass.clone()
     for j in range(t.njoint - 1, 0, -1):
         if t.joint_parent[j] > 0:
-            carried[t.joint_parent[j] - 1] += carried[j]
-    sense = torch.ones_like(mass)
-    return a.joint_frame[:, :3, :3], a.joint_frame[:, :3, 3], a.joint_ref, sense, mass, center, second, carried
+            carried[..., t.joint_parent[j] - 1] += carried[..., j]
+    sense = mass.new_ones(t.njoint)
+    return a.joint_frame[..., :3, :3], a.joint_frame[..., :3, 3], a.joint_ref, sense, mass, center, second, carried
 
 
 class _Terms:
@@ -202,8 +227,6 @@ class _Terms:
                 raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
             self._take(a, inner)
-        if any(x.ndim != 1 for x in (self.share, self.spring, self.damping, self.armature, self.dry, self.limit, self.rest)):
-            raise unknown("parameters of joints of their own for each world")
         self._require_own_drives()
 
     def _take(self, a: Articulation, term: Any) -> None:
@@ -221,8 +244,6 @@ class _Terms:
                 if term.drives is not None:
                     self.limit_per_force, self.drives = term.share / HELD**2, term.drives
             case Actuators():
-                if term.gear.ndim != 1:
-                    raise unknown("actuators of their own for each world")
                 self.actuators = term
             case Contact():
                 self.candidates.take(a, term)
@@ -234,12 +255,11 @@ class _Terms:
             raise unknown("limits that other actuators press on than the scene's own")
 
     def _push(self, a: Articulation, term: Pushes) -> None:
-        if term.force.ndim != 2 or term.point.ndim != 2:
-            raise unknown("pushes of their own for each world")
-        links = torch.tensor(a.topology.link_node, device=a.device)
-        some = ((links > 0) & (term.force != 0).any(-1)).nonzero().squeeze(-1)  # what rides on the world does not move
+        links = torch.tensor(a.topology.link_node)
+        acts = (term.force != 0).any(-1).reshape(-1, len(links)).any(0)  # in some world
+        some = ((links > 0) & acts).nonzero().squeeze(-1)  # what rides on the world does not move
         self.pushed += (links[some] - 1).tolist()
-        self.pushes.append((on_nodes(a, some, term.point[some]), term.force[some]))
+        self.pushes.append((on_nodes(a, some, term.point[..., some, :]), term.force[..., some, :]))
 
 
 def _alike(one: Actuators, other: Actuators | None) -> bool:
@@ -247,4 +267,4 @@ def _alike(one: Actuators, other: Actuators | None) -> bool:
     if other is None:
         return False
     names = ("dof", "gear", "gain", "bias", "stiffness", "control_range", "force_range")
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+    return one is other or all(bool((getattr(one, name) == getattr(other, name)).all()) for name in names)

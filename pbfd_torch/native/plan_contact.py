@@ -31,18 +31,19 @@ KINDS = (
     *((solid, BALL) for solid in CONVEX + UNEVEN),
     *((solid, ELLIPSOID) for solid in UNEVEN),  # on convex ones they touch as convex bodies do (terms/contact_terms.py)
 )
+GRIP = 4  # which of the numbers of a candidate μ is
 PLANAR = 2  # of them, the first: what the core knows in a plane
 
 
 def link_frames(a: Articulation, link: Tensor) -> Tensor:
-    """Where links `[n]` are on their nodes, `[n, 4, 4]`: what is fixed to a link is told to the core through these."""
-    return a.link_frame[link]
+    """Where links `[n]` are on their nodes, `[*, n, 4, 4]`: what is fixed to a link is told to the core through these."""
+    return a.link_frame[..., link, :, :]
 
 
 def on_nodes(a: Articulation, link: Tensor, points: Tensor) -> Tensor:
-    """Points of links `[n, 3]` as they are on the nodes, `[n, 3]` [m]."""
+    """Points of links `[*, n, 3]` as they are on the nodes, `[*, n, 3]` [m]."""
     frame = link_frames(a, link)
-    return (frame[:, :3, :3] @ points[..., None]).squeeze(-1) + frame[:, :3, 3]
+    return (frame[..., :3, :3] @ points[..., None]).squeeze(-1) + frame[..., :3, 3]
 
 
 @dataclass
@@ -52,9 +53,10 @@ class Candidates:
     Attributes:
         indices: node, solid, form and place among the anchors (−1: none) of each candidate of each kind.
         places: of each, among the candidates of all terms, those that ride on the world too; `taken`: how many these are.
-        rows: the numbers of some candidates of each kind, `[n, …]` each. grips: their μ, `[*batch, n]`.
-        planes: `[4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes and
-            thickness `[19]`. samples: of all grids. forms: M, axis and `lying`, `[n, …]` each.
+        rows: the numbers of each candidate of each kind, `[*, …]` each, as all of these that follow.
+        planes: `[*, 4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes
+            and thickness. forms: M, axis and `lying` of some, side by side.
+        samples: of all grids, `[n]`.
         anchors: how many each contact has: none, or one for each candidate, those of links that ride on the world too.
     """
 
@@ -62,18 +64,17 @@ class Candidates:
     places: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     taken: int = 0
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
-    grips: list[list[Tensor]] = field(default_factory=lambda: [[] for _ in KINDS])
     planes: list[Tensor] = field(default_factory=list)
     grids: list[int] = field(default_factory=list)
     solids: list[Sequence[Tensor]] = field(default_factory=list)
-    samples: list[Tensor] = field(default_factory=list)
     forms: list[Sequence[Tensor]] = field(default_factory=list)
+    samples: list[Tensor] = field(default_factory=list)
     anchors: list[int] = field(default_factory=list)
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Of src/candidates.h: candidates, anchors, planes, solids, samples, forms."""
-        forms = sum(len(form) for form, _, _ in self.forms)
+        forms = sum(len(lying) for _, _, lying in self.forms)
         samples = sum(map(len, self.samples))
         return sum(map(len, self.indices)), sum(self.anchors), len(self.planes), len(self.solids), samples, forms
 
@@ -83,9 +84,14 @@ class Candidates:
         return tuple(chain(*self.places))
 
     @property
+    def grips(self) -> list[Tensor]:
+        """μ of each."""
+        return [row[GRIP] for rows in self.rows for row in rows]
+
+    @property
     def normals(self) -> list[Tensor]:
         """Of all half-spaces."""
-        return [x[:3] for x in self.planes]
+        return [x[..., :3] for x in self.planes]
 
     @property
     def flat(self) -> bool:
@@ -96,7 +102,7 @@ class Candidates:
         """The same in a plane, where they are `flat`."""
         rows: list[list[Sequence[Tensor]]] = []
         for indices, row in zip(self.indices, self.rows, strict=True):
-            rows.append([(plane.on_nodes([node], x[0]), *x[1:]) for (node, *_), x in zip(indices, row, strict=True)])
+            rows.append([(plane.on_nodes([node], x[0][None])[0], *x[1:]) for (node, *_), x in zip(indices, row, strict=True)])
         planes = [torch.cat((x[:3] @ plane.basis, x[3:])) for x in self.planes]
         return replace(self, indices=self.indices[:PLANAR], rows=rows, planes=planes)
 
@@ -106,17 +112,8 @@ class Candidates:
 
     def real(self) -> Sequence[Tensor]:
         """The numbers."""
-        tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, [[x] for x in self.samples], self.forms)
-        return [torch.cat([x.reshape(-1) for x in column]) for table in tables for column in zip(*table, strict=True)]
-
-    @property
-    def grip(self) -> Tensor | None:
-        """μ of all candidates `[*batch, n]`, where worlds differ."""
-        grips = list(chain(*self.grips))
-        if all(x.ndim == 1 for x in grips):
-            return None
-        batch = torch.broadcast_shapes(*(x.shape[:-1] for x in grips))
-        return torch.cat([x.expand(*batch, -1) for x in grips], -1)
+        tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, self.forms)
+        return [x for table in tables for column in zip(*table, strict=True) for x in column]
 
     def take(self, a: Articulation, term: Contact) -> None:
         """Adds the candidates of a contact. Raises `NotCompiledError`."""
@@ -127,29 +124,22 @@ class Candidates:
         width, anchored = _width(friction), isinstance(friction, AnchoredFriction)
         if term.restitution is not None:
             raise unknown("restitution")
-        if term.position.ndim != 2 or term.radius.ndim != 1 or term.margin.ndim != 1:
-            raise _differing(name)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
         moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0], dtype=torch.long)  # others ride on the world
 
         def each(value: float | Tensor | None, other: float) -> Tensor:
             number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
-            if number.ndim > 1:
-                raise _differing(name)
-            return number.expand(len(nodes))
+            return number.expand(*number.shape[:-1], len(nodes))
 
         mu = friction.mu if isinstance(friction, DryFriction) else 0.0
-        grip = torch.as_tensor(mu if term.grip is None else mu * term.grip, dtype=a.dtype)
-        grip = grip.expand(*grip.shape[:-1], len(nodes))
         numbers = (
-            on_nodes(a, term.link, term.position),
             term.radius,
             term.margin,
             each(law.stiffness, 0.0) * each(term.firm, 1.0),
-            grip.reshape(-1, len(nodes))[0],  # where worlds differ they bring their own
+            each(mu if term.grip is None else mu * term.grip, 0.0),
             each(term.deep, torch.finfo(a.dtype).max),
-            each(law.release, 0.0),
-            each(width, 1.0),
+            1.0 / each(law.release, 0.0),
+            1.0 / each(width, 1.0),
         )
         anchor = sum(self.anchors)
         self.anchors.append(len(nodes) if anchored else 0)
@@ -158,21 +148,21 @@ class Candidates:
         if len(moving) == 0:
             return
         solid, first = self._solid(a, term, name), self.sizes[-1]
+        positions, flat = on_nodes(a, term.link, term.position), isinstance(term.surface, Plane)
+        rounded = (term.radius > 0).reshape(-1, len(nodes)).any(0).tolist()  # in some world
         if isinstance(term, CurvedContact):
             if (type(term.surface), ELLIPSOID) not in KINDS:
                 raise unknown(f"curved bodies on '{name}', which is a {type(term.surface).__name__}")
-            self._add_forms(a, term, name)
+            self._add_forms(a, term)
         for i in moving.tolist():
             if isinstance(term, CurvedContact):
                 support, form = ELLIPSOID, first + i
             else:
-                flat = isinstance(term.surface, Plane) and not bool(term.radius[i] > 0)
-                support, form = (POINT if flat else BALL), 0
+                support, form = (POINT if flat and not rounded[i] else BALL), 0
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
             self.places[kind].append(before + i)
-            self.rows[kind].append([x[i, None] for x in numbers])
-            self.grips[kind].append(grip[..., i, None])
+            self.rows[kind].append([positions[..., i, :], *(x[..., i, None] for x in numbers)])
 
     def _solid(self, a: Articulation, term: Contact, name: str) -> int:
         """Adds what is touched; its number."""
@@ -181,37 +171,35 @@ class Candidates:
         if carrier is not None:
             if carrier.motion.moves or any(carrier.motion.belt):
                 raise unknown(f"contact with '{name}', which moves")
-            if carrier.start.ndim > 2:
-                raise _differing(name)
             frame = carrier.start
         if isinstance(surface, Plane) and carrier is None:
-            self.planes.append(torch.cat((_one(surface.normal, 3, name), _one(surface.offset, 1, name))))
+            self.planes.append(joined(_one(surface.normal, 1, name), _one(surface.offset, 0, name)))
             return len(self.planes) - 1
-        grid, size = [0, 0, 0, 0], torch.zeros(6, dtype=a.dtype)
+        grid, sizes = [0, 0, 0, 0], list[Tensor]()
         match surface:
             case SphereSurface():
-                size[:1] = _one(surface.radius, 1, name)
+                sizes = [_one(surface.radius, 0, name)]
             case SegmentSurface():
-                start, end = _one(surface.start, 3, name), _one(surface.end, 3, name)
-                size[0], size[1] = _one(surface.radius, 1, name)[0], 0.5 * torch.linalg.vector_norm(end - start)
+                start, end = _one(surface.start, 1, name), _one(surface.end, 1, name)
+                half = 0.5 * torch.linalg.vector_norm(end - start, dim=-1, keepdim=True)
+                sizes = [_one(surface.radius, 0, name), half]
                 along = _along(start, end)
-                if any(self.anchors[-1:]) and not torch.equal(along[:3, :3], torch.eye(3, dtype=a.dtype)):
+                if any(self.anchors[-1:]) and not bool((along[..., :3, :3] == torch.eye(3, dtype=a.dtype)).all()):
                     raise unknown(f"anchors on '{name}', a capsule that does not lie along z")
                 frame = frame @ along
             case BoxSurface():
-                size[:3] = _one(surface.half_extents, 3, name)
+                sizes = [_one(surface.half_extents, 1, name)]
             case CylinderSurface():
-                size[:2] = torch.cat((_one(surface.radius, 1, name), _one(surface.half_length, 1, name)))
+                sizes = [_one(surface.radius, 0, name), _one(surface.half_length, 0, name)]
             case HeightSurface():
-                size[:4] = torch.cat((surface.origin, surface.spacing))
-                grid = self._sampled(surface.coefficients)
+                sizes, grid = [surface.origin, surface.spacing], self._sampled(surface.coefficients)
             case DistanceGrid():
-                size[:4] = torch.cat((surface.origin, surface.spacing.reshape(1)))
-                grid = self._sampled(surface.coefficients)
+                sizes, grid = [surface.origin, surface.spacing.reshape(1)], self._sampled(surface.coefficients)
             case _:
                 raise unknown(f"contact with '{name}', which is a {type(surface).__name__}")
         self.grids += grid
-        placed = torch.cat((frame[:3, :3].reshape(9), frame[:3, 3]))
+        placed = joined(frame[..., :3, :3].flatten(-2), frame[..., :3, 3])
+        size = torch.nn.functional.pad(known := joined(*sizes), (0, 6 - known.shape[-1]))
         self.solids.append((placed, size, torch.tensor([term.thickness], dtype=a.dtype)))
         return len(self.solids) - 1
 
@@ -221,16 +209,14 @@ class Candidates:
         self.samples.append(coefficients.reshape(-1))
         return [first, *coefficients.shape, 1][:4]
 
-    def _add_forms(self, a: Articulation, term: CurvedContact, name: str) -> None:
-        if term.form.ndim != 3 or term.axis.ndim != 2:
-            raise _differing(name)
-        turn = link_frames(a, term.link)[:, :3, :3]
+    def _add_forms(self, a: Articulation, term: CurvedContact) -> None:
+        turn = link_frames(a, term.link)[..., :3, :3]
         axis = (turn @ term.axis[..., None]).squeeze(-1)
-        self.forms.append((turn @ term.form @ turn.mT, axis, term.lying.to(term.form.dtype)))
+        self.forms.append(((turn @ term.form @ turn.mT).flatten(-3), axis.flatten(-2), term.lying.to(term.form.dtype)))
 
 
 def _differing(name: str) -> NotCompiledError:
-    return unknown(f"contact with '{name}' of its own for each world")
+    return unknown(f"contact with '{name}' of its own for each candidate")
 
 
 def _width(friction: FrictionLaw | None) -> float:
@@ -244,19 +230,26 @@ def _width(friction: FrictionLaw | None) -> float:
     raise unknown(type(friction).__name__)
 
 
-def _one(value: Tensor, count: int, name: str) -> Tensor:
-    """The `[count]` numbers that all candidates and worlds share."""
-    if value.numel() != count:
+def _one(value: Tensor, rank: int, name: str) -> Tensor:
+    """Numbers `[*, count]` that all candidates share, of a value `[*, n or 1, *event]` whose event has this rank."""
+    if value.ndim > rank and value.shape[value.ndim - 1 - rank] != 1:
         raise _differing(name)
-    return value.reshape(count)
+    if rank == 0:
+        return value.reshape(*value.shape[:-1], 1)
+    return value.squeeze(-1 - rank) if value.ndim > rank else value
+
+
+def joined(*pieces: Tensor, dim: int = -1) -> Tensor:
+    """Numbers `[*, n]` side by side along a dimension, counted from the end, some of them of each world."""
+    batch = torch.broadcast_shapes(*(x.shape[:dim] for x in pieces))
+    return torch.cat([x.expand(*batch, *x.shape[dim:]) for x in pieces], dim)
 
 
 def _along(start: Tensor, end: Tensor) -> Tensor:
-    """The frame `[4, 4]` in the middle of a segment whose z axis lies along it."""
-    along = end - start
-    if not bool(along.abs().max() > 0):
-        along = torch.tensor([0.0, 0.0, 1.0], dtype=start.dtype)
-    z = along / torch.linalg.vector_norm(along)
-    y = torch.linalg.cross(z, torch.eye(3, dtype=z.dtype)[z.abs().argmin()])
-    y = y / torch.linalg.vector_norm(y)
+    """The frame `[*, 4, 4]` in the middle of a segment whose z axis lies along it."""
+    eye, along = torch.eye(3, dtype=start.dtype), end - start
+    along = torch.where((along != 0).any(-1, keepdim=True), along, eye[2])
+    z = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+    y = torch.linalg.cross(z, eye[z.abs().argmin(-1)])
+    y = y / torch.linalg.vector_norm(y, dim=-1, keepdim=True)
     return homogeneous(torch.stack((torch.linalg.cross(y, z), y, z), -1), 0.5 * (start + end))

@@ -28,9 +28,8 @@ _SOLUTION = ("status", "iterations", "evaluations", "residual_norm", "fallbacks"
 
 class _Roster(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int) for name in ("links", "slots", "first_limit", "still_suspect")),
-        *((name, ctypes.c_void_p) for name in ("carrier", "slot", "danger", "frame", "mass")),
-        *((name, ctypes.c_void_p) for name in ("still_moment", "still_energy", "still_strain")),
+        *((name, ctypes.c_int) for name in ("links", "slots", "first_limit", "own")),
+        *((name, ctypes.c_void_p) for name in ("carrier", "slot", "danger", "real")),
     )
 
 
@@ -40,7 +39,7 @@ class _Record(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
         ("given", ctypes.c_void_p * 10),
         ("found", ctypes.c_void_p * 10),
-        *((name, ctypes.c_void_p) for name in ("hazards", "grip", *_STATE, *CONTACT, "suspect")),
+        *((name, ctypes.c_void_p) for name in ("hazards", "own", *_STATE, *CONTACT, "suspect")),
     )
 
 
@@ -52,11 +51,7 @@ class Writer(Generic[S]):
         space = plan if plan.dimension == 3 else planned_in_space(eager)
         self.roster = rostered(eager, space)
         self._scheme, self._plan = SCHEMES[type(eager.integrator)], plan
-        self._calls, self._grip = Calls(library, space, threads), space.grip
-        r = self.roster
-        self._roster = _Roster(len(r.carrier), r.slots, r.first_limit, r.still_suspect)
-        for name in ("carrier", "slot", "danger", "frame", "mass", "still_moment", "still_energy", "still_strain"):
-            setattr(self._roster, name, getattr(r, name).data_ptr())
+        self._calls, self._own = Calls(library, space, threads), space.own
 
     def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
         """Of steps from the state before the first to those after each `[steps, *batch, …]`, in arrays of this length: the state
@@ -69,10 +64,13 @@ class Writer(Generic[S]):
             asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
         for name, array in arrays.items():
             setattr(asked, name, array.data_ptr())
-        grip = None if self._grip is None else whole(self._grip, (*batch, self._grip.shape[-1]))
-        if grip is not None:
-            asked.grip = grip.data_ptr()
-        self._calls.share(f"{self._scheme.function}_record", asked, steps, steps // WORTH_A_BLOCK, self._roster)
+        own, r = whole(self._own, (*batch, self._own.shape[-1])), self.roster
+        asked.own = own.data_ptr()
+        real = r.real if r.real.ndim == 1 else whole(r.real, (*batch, r.real.shape[-1]))
+        listed = _Roster(len(r.carrier), r.slots, r.first_limit, real.ndim > 1)
+        for name, table in {"carrier": r.carrier, "slot": r.slot, "danger": r.danger, "real": real}.items():
+            setattr(listed, name, table.data_ptr())
+        self._calls.share(f"{self._scheme.function}_record", asked, steps, steps // WORTH_A_BLOCK, listed)
 
 
 class Record(Generic[S]):
@@ -92,7 +90,10 @@ class Record(Generic[S]):
         }
         slots, still = roster.still
         for name, values in still.items():
-            self._contacts[name].flatten(0, len(batch))[:, slots] = values
+            if CONTACT[name]:
+                self._contacts[name][..., slots, :] = values
+            else:
+                self._contacts[name][..., slots] = values
         writer.write(state, state, {name: x[:1] for name, x in self._states.items()})
 
     def add(self, before: S, states: S, solution: Solution) -> None:

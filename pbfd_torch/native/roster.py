@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.plan import Plan
+from pbfd_torch.native.plan_contact import joined
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -21,20 +22,15 @@ from pbfd_torch.tree.kinematics import place
 
 @dataclass(frozen=True, eq=False)
 class Roster:
-    """See `pbfd_roster` in src/interface.h. still: of the contacts that ride on the world, which never change: their slots `[n]`,
-    and what a record has of them, `[n]` or `[n, 3]`."""
+    """See `pbfd_roster` in src/interface.h; real: `[*, 12 · links + 7]`. still: of the contacts that ride on the world, which never
+    change: their slots `[n]`, and what a record has of them, `[*, n]` or `[*, n, 3]`."""
 
     slots: int
     carrier: Tensor
     slot: Tensor
     danger: Tensor
-    frame: Tensor
-    mass: Tensor
     first_limit: int
-    still_moment: Tensor
-    still_energy: Tensor
-    still_strain: Tensor
-    still_suspect: int
+    real: Tensor
     still: tuple[Tensor, dict[str, Tensor]]
 
 
@@ -44,20 +40,17 @@ def rostered(stepper: EagerStepper[Any], plan: Plan) -> Roster:
     a = aligned(stepper.articulation)
     carrier = torch.tensor(a.topology.link_node, dtype=torch.int32) - 1
     dangers, first_limit = _dangers(stepper)
-    moment = (a.link_frame @ a.pseudo_inertia)[carrier < 0][:, :3, 3].sum(0)
+    moment = (a.link_frame @ a.pseudo_inertia)[..., carrier < 0, :3, 3].sum(-2)
     still = _Still(stepper, dangers)
+    energy = still.energy - (stepper.scene.gravity * moment).sum(-1)
+    numbers = (a.mass.sum(-1), moment, energy, still.strain, still.suspect.to(a.dtype))
     return Roster(
         slots=len(dangers),
         carrier=carrier,
         slot=torch.tensor(plan.order, dtype=torch.int32),
         danger=torch.tensor([dangers[i] for i in plan.order], dtype=torch.int32),
-        frame=a.link_frame[:, :3].contiguous(),
-        mass=a.mass.sum().reshape(1),
         first_limit=first_limit,
-        still_moment=moment,
-        still_energy=(still.energy - (stepper.scene.gravity * moment).sum()).reshape(1),
-        still_strain=a.rest.new_tensor([still.strain]),
-        still_suspect=still.suspect,
+        real=joined(a.link_frame[..., :3, :].flatten(-3), *(x if x is moment else x[..., None] for x in numbers)).contiguous(),
         still=(torch.tensor(still.slots, dtype=torch.long), still.seen),
     )
 
@@ -77,15 +70,16 @@ def _dangers(stepper: EagerStepper[Any]) -> tuple[list[int], int]:
 
 
 class _Still:
-    """The contacts that ride on the world: their slots and what is seen of them, the energy [J] that they store together, and of
-    the one that is deepest beyond its measure how far, and its number among the dangers."""
+    """The contacts that ride on the world: their slots and what is seen of them, `[*, n, …]`; the energy [J] that they store
+    together, and of the one that is deepest beyond its measure how far, and its number among the dangers, `[*]` each."""
 
     def __init__(self, stepper: EagerStepper[Any], dangers: list[int]) -> None:
         a = stepper.articulation
         step = _resting(stepper, a)
         self.slots: list[int] = []
-        self.energy, self.strain, self.suspect = a.rest.new_zeros(()), -math.inf, 0
+        self.energy = a.rest.new_zeros(())
         parts: dict[str, list[Tensor]] = {name: [a.rest.new_zeros((0, *event))] for name, event in CONTACT.items()}
+        shares = [a.rest.new_tensor([-math.inf])]  # of none
         first = 0
         for term in stepper.terms:
             if not isinstance(term, Contact):
@@ -95,18 +89,19 @@ class _Still:
                 prepared = term.prepare(step)
                 points = term.points(prepared, step.previous)
                 for name, event in CONTACT.items():
-                    values = getattr(points, name.removeprefix("contact_"))
-                    parts[name].append(values.reshape(-1, len(term.link), *event)[0, here])  # of one world: all slips are zero
+                    values = getattr(points, name.removeprefix("contact_"))  # all slips are zero
+                    parts[name].append(values.movedim(-1 - len(event), 0)[here].movedim(0, -1 - len(event)))
                 force, depth = parts["contact_force"][-1], parts["contact_depth"][-1]
-                self.energy = self.energy + (torch.linalg.vector_norm(force, dim=-1) * depth.clamp_min(0)).sum() / 3
+                self.energy = self.energy + (torch.linalg.vector_norm(force, dim=-1) * depth.clamp_min(0)).sum(-1) / 3
                 turned = torch.zeros(a.topology.nlink, dtype=torch.bool)
-                share = term.strain(prepared, step.previous, turned)[0].reshape(-1, len(term.link))[0]
-                for i in here:
-                    if float(share[i]) > self.strain:
-                        self.strain, self.suspect = float(share[i]), dangers[first + i]
+                shares.append(term.strain(prepared, step.previous, turned)[0][..., here])
             self.slots += [first + i for i in here]
             first += len(term.link)
-        self.seen = {name: torch.cat(values) for name, values in parts.items()}
+        share = joined(*shares)
+        worst = share.argmax(-1, keepdim=True)
+        self.strain = share.gather(-1, worst).squeeze(-1)
+        self.suspect = torch.tensor([0, *(dangers[slot] for slot in self.slots)])[worst.squeeze(-1)]
+        self.seen = {name: joined(*values, dim=-1 - len(CONTACT[name])) for name, values in parts.items()}
 
 
 CONTACT = {"contact_depth": (), **dict.fromkeys(("contact_point", "contact_normal", "contact_force", "contact_slip"), (3,))}

@@ -34,12 +34,12 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 
 class NativeStepper(Generic[S]):
     """A `Stepper` whose steps the compiled core makes, fallbacks and all, of what an `EagerStepper` is made of. `threads`: at most,
-    for batches that are worth it; None: as many as PyTorch uses. Raises `InputError` where there is no core, and for a scene that
-    it does not know, naming what it lacks (`uncovered`)."""
+    for batches that are worth it; None: as many as PyTorch uses. `plan`: of these steps, where it is known (`plan_of`). Raises
+    `InputError` where there is no core, and for a scene that it does not know, naming what it lacks (`uncovered`)."""
 
-    def __init__(self, eager: EagerStepper[S], threads: int | None = None) -> None:
+    def __init__(self, eager: EagerStepper[S], threads: int | None = None, plan: Plan | None = None) -> None:
         try:
-            plan = _planned(eager)
+            plan = plan or plan_of(eager)
         except NotCompiledError as missing:
             raise InputError(f"no compiled steps: {missing}") from missing
         compiled = library()
@@ -58,7 +58,7 @@ class NativeStepper(Generic[S]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads the core itself."""
-        return NativeStepper, (self.eager, self.threads)
+        return NativeStepper, (self.eager, self.threads, self._core.plan)
 
     @property
     def scene(self) -> Scene:
@@ -151,8 +151,8 @@ class NativeStepper(Generic[S]):
         return self.eager.objective(state, control)
 
     def take(self, worlds: Worlds) -> NativeStepper[S]:
-        """See `Stepper`."""
-        return NativeStepper(self.eager.take(worlds), self.threads)
+        """See `Stepper`: to the bit what they do among all."""
+        return NativeStepper(self.eager.take(worlds), self.threads, self._core.plan.take(worlds))
 
     def sized(self, step_size: Tensor) -> NativeStepper[S]:
         """See `Stepper`."""
@@ -162,14 +162,14 @@ class NativeStepper(Generic[S]):
 def uncovered(eager: EagerStepper[Any]) -> str:
     """Why the compiled core cannot make these steps, in words; nothing where it can."""
     try:
-        _planned(eager)
+        plan_of(eager)
     except NotCompiledError as missing:
         return str(missing)
     return ""
 
 
-def _planned(eager: EagerStepper[Any]) -> Plan:
-    """Raises `NotCompiledError`."""
+def plan_of(eager: EagerStepper[Any]) -> Plan:
+    """The plan of steps that the core can make. Raises `NotCompiledError` for others, and where there is no core."""
     if library() is None:
         raise NotCompiledError(reason())
     if eager.solver != Fallbacks():

@@ -47,8 +47,8 @@ struct Scene {
     each(-inf, -inf), each(inf, inf), each(0, 0), add({0, 0, 0, 1, 0, 0, 0});
     add({0, 0, -G, reach, 1, 0, 1e-3});
     real.insert(real.end(), b.positions.begin(), b.positions.end());
-    all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(0.1), all(b.anchored ? 1e-4 : 1e-3), add({0, 0, 1, 0});
-    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, whole.data(), real.data()};
+    all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(1 / 0.1), all(b.anchored ? 1 / 1e-4 : 1 / 1e-3), add({0, 0, 1, 0});
+    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, 0, whole.data(), real.data(), nullptr, nullptr};
     CHECK(pbfd_whole_numbers(&plan) == long(whole.size()));
     CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   }
@@ -61,7 +61,7 @@ struct Run {
   int worlds, steps;
   std::vector<int> widths;
   std::vector<Numbers> given, found;
-  Numbers residual_norm, trial[5];
+  Numbers residual_norm, trial[7];
   std::vector<int> counted[4], fallbacks;
 
   Run(int count, int length, std::vector<int> sizes) : worlds(count), steps(length), widths(sizes) {
@@ -72,12 +72,13 @@ struct Run {
     for (auto& x : trial) x.resize(count * NQ);
   }
 
-  void make(const Scene& scene, Step step, double dt) {
+  // own: numbers of each world, where the plan says which these are.
+  void make(const Scene& scene, Step step, double dt, const double* own = nullptr) {
     void* room = std::aligned_alloc(64, (pbfd_room(&scene.plan) + 127) / 64 * 64);
-    pbfd_steps s{dt, 1e-9, 1e-3, 1, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), nullptr, {}};
+    pbfd_steps s{dt, 1e-9, 1e-3, 1, 1e300, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), own, {}};
     for (std::size_t i = 0; i < given.size(); i++) s.given[i] = given[i].data(), s.found[i] = found[i].data();
     for (int i = 0; i < 4; i++) s.counted[i] = counted[i].data();
-    for (int i = 0; i < 5; i++) s.trial[i] = trial[i].data();
+    for (int i = 0; i < 7; i++) s.trial[i] = trial[i].data();
     step(&scene.plan, &s, room);
     std::free(room);
   }

@@ -18,7 +18,7 @@ constexpr int NQ = 7, NV = 6, WORLDS = 11, KINDS = Candidates<double, 3>::KINDS,
 // A free body at z = 1.2 or so that touches a solid whose top is at z = 1, by a candidate of one kind.
 struct Scene {
   std::vector<int> whole;
-  std::vector<double> real;
+  std::vector<double> real, heights;
   Sizes sizes;
 
   Scene(int kind, bool anchored) {
@@ -39,7 +39,7 @@ struct Scene {
     each(-INF, -INF), each(INF, INF), each(0, 0);
     real.insert(real.end(), {0, 0, 0, 1, 0, 0, 0});
     real.insert(real.end(), {0, 0, -9.81, 0.2, 1, 0, 1e-3});
-    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 0.3, anchored ? 1e-3 : 1e-2});
+    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 1 / 0.3, anchored ? 1 / 1e-3 : 1 / 1e-2});
     if (plane) real.insert(real.end(), {0, 0, 1, 1});
     if (!plane) {
       real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == 4 ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
@@ -47,7 +47,7 @@ struct Scene {
       real.insert(real.end(), sizes[solid], sizes[solid] + 6);
       real.push_back(solid < 4 ? 1 : INF);
       for (int i = 0; i < samples; i++)  // hills, or heights above z = 1, with waves
-        real.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
+        heights.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
     }
     if (rim) real.insert(real.end(), {0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.03, 0, 1, 0, 0});
     sizes = {{1, anchored, plane, !plane, samples, rim}, 1, NQ, NV, 0, 0, 0};
@@ -82,7 +82,7 @@ void start(double* q, int world, double height) {
 
 void of_kind(int kind, bool anchored) {
   const Scene scene(kind, anchored);
-  const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data());
+  const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data(), scene.heights.data());
   const double height = scene.sizes.forms ? 1.15 : 1.17;
   using V = Lanes<double, 4>;
   Room<double> alone(scene.sizes), beside(scene.sizes);
@@ -92,6 +92,8 @@ void of_kind(int kind, bool anchored) {
   Balance<double, double> b(plan, arena), moved(plan, second);
   Outlook<double, double> outlook(plan, arena);
   Balance<V, double> all(plan, wide);
+  const V grip(plan.contact.grip[0]);
+  b.contacts.grip = moved.contacts.grip = plan.contact.grip, all.contacts.grip = &grip;
   double v[NV], room[18];
   V q_all[NQ], v_all[NV], room_all[18];
   int touched = 0;

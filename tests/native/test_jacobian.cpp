@@ -47,7 +47,7 @@ int main() {
   const std::vector<double> real = real_numbers();
   CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));
   CHECK(Plan<double>::real_numbers(sizes) == int(real.size()));
-  const Plan<double> plan(sizes, whole.data(), real.data());
+  const Plan<double> plan(sizes, whole.data(), real.data(), nullptr);
   std::vector<double> memory(Balance<double, double>::room(sizes));
   Arena<double> arena{memory.data()};
   Balance<double, double> b(plan, arena);

@@ -13,18 +13,20 @@ constexpr int WORLDS = 3, STEPS = 60, TOTAL = WORLDS * STEPS;
 
 // The ball's link is turned and moved on its node; its contact is in the second of two slots.
 struct Seen {
-  Numbers q, v, poses, center, kinetic, potential, linear, angular, depth, point, normal, force, slip;
+  bodies::Numbers q, v, poses, center, kinetic, potential, linear, angular, depth, point, normal, force, slip;
   std::vector<int> suspect;
 
   Seen()
       : q(TOTAL * NQ), v(TOTAL * NV), poses(TOTAL * 12), center(TOTAL * 3), kinetic(TOTAL), potential(TOTAL), linear(TOTAL * 3),
         angular(TOTAL * 3), depth(TOTAL * 2, -7.0), point(TOTAL * 6), normal(TOTAL * 6), force(TOTAL * 6), slip(TOTAL * 6), suspect(TOTAL) {}
 
-  void write(const Scene& scene, const Run& run, int first, int last) {
+  // own: what is listed is given for each world.
+  void write(const Scene& scene, const Run& run, int first, int last, bool own = false) {
     const int carrier = 0, slot = 1, danger = 4;
-    const double mass = MASS + 1, moment[3] = {0, 0, 5}, energy = 5 * G, strain = -1;
-    const double frame[12] = {0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3};
-    const pbfd_roster roster{1, 2, -1, 3, &carrier, &slot, &danger, frame, &mass, moment, &energy, &strain};
+    const double real[19] = {0, -1, 0, 0.1, 1, 0, 0, 0.2, 0, 0, 1, 0.3, MASS + 1, 0, 0, 5, 5 * G, -1, 3};
+    bodies::Numbers each;
+    for (int w = 0; w < WORLDS; w++) each.insert(each.end(), real, real + 19);
+    const pbfd_roster roster{1, 2, -1, own, &carrier, &slot, &danger, own ? each.data() : real};
     pbfd_record record{DT, WORLDS, first, last, {}, {}, run.counted[3].data(), nullptr, q.data(), v.data(), poses.data(),
                        center.data(), kinetic.data(), potential.data(), linear.data(), angular.data(), depth.data(), point.data(),
                        normal.data(), force.data(), slip.data(), suspect.data()};
@@ -46,11 +48,12 @@ int main() {
   Run run(WORLDS, STEPS, VELOCITIES);
   for (int w = 0; w < WORLDS; w++) run.given[0][w * NQ + 2] = 0.3 + 0.1 * w, run.given[1][w * NV + 5] = SPIN;
   run.make(scene, pbfd_energy_momentum, DT);
-  Seen seen, parts;
-  seen.write(scene, run, 0, TOTAL);
+  Seen seen, each, parts;
+  seen.write(scene, run, 0, TOTAL), each.write(scene, run, 0, TOTAL, true);
   for (int at = 0; at < TOTAL; at += 7) parts.write(scene, run, at, at + 7 < TOTAL ? at + 7 : TOTAL);
   CHECK(seen.kinetic == parts.kinetic && seen.potential == parts.potential);
   CHECK(seen.force == parts.force && seen.poses == parts.poses);
+  CHECK(seen.center == each.center && seen.potential == each.potential && seen.poses == each.poses && seen.suspect == each.suspect);
 
   bool struck = false;
   for (int i = 0; i < TOTAL; i++) {

@@ -7,13 +7,10 @@
 namespace pbfd {
 
 template <class V, class N, int D> struct Contacts {
-  using Scalar = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
-  // of the worlds in the lanes
-  const Scalar* own_grip = nullptr;  // [worlds, candidates], where worlds differ
-  V* grip;                           // μ [candidates]
+  const V* grip = nullptr;  // μ [candidates] of the worlds in the lanes
   const Relaxed<V>& relaxed;
   // what is fixed in a step
   const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
@@ -27,20 +24,13 @@ template <class V, class N, int D> struct Contacts {
   bool* turned;
 
   static int room(Sizes s) {
-    return (4 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
   Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
       : plan(scene), candidates(scene.contact), relaxed(easier) {
-    grip = arena.take(plan.candidates), share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
+    share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
-    for (int i = 0; i < plan.candidates; i++) grip[i] = V(candidates.grip[i]);
-  }
-
-  // A lane takes a world.
-  void load(int i, int world) {
-    if (!own_grip) return;
-    for (int j = 0; j < plan.candidates; j++) put(grip[j], i, own_grip[long(world) * plan.candidates + j]);
   }
 
   // The step begins at these poses, and would lead to `free` without contacts.
@@ -128,7 +118,7 @@ template <class V, class N, int D> struct Contacts {
         center(i, at, c);
         V firmness = V(candidates.firmness[i]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
-        release_law(firmness, depth(pair, i, at, c, solid), start, per_dt * V(N(1) / candidates.release[i]), push, rises);
+        release_law(firmness, depth(pair, i, at, c, solid), start, per_dt * V(candidates.per_release[i]), push, rises);
         visit(i, push);
       }
     });
@@ -165,7 +155,7 @@ template <class V, class N, int D> struct Contacts {
     if constexpr (Pair::Support::wanders)
       firmness = firmness * Pair::Support::share(candidates, i, now.rotation + D * D * candidates.carrier[i], solid.normal);
     const V d = max(sunk(Pair(), i, now, solid), V(0));
-    return V(N(1) / N(3)) * firmness * d * d * d;
+    return V(1) / V(3) * firmness * d * d * d;
   }
 
   // The rest of what is to be known of a candidate whose centre and depth are.
@@ -187,8 +177,8 @@ template <class V, class N, int D> struct Contacts {
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
     t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
-    t.per_range = per_dt * V(N(1) / candidates.release[i]);
-    t.per_width = (anchored(i) ? V(1) : per_dt) * V(N(1) / candidates.width[i]) / relaxed.width;
+    t.per_range = per_dt * V(candidates.per_release[i]);
+    t.per_width = (anchored(i) ? V(1) : per_dt) * V(candidates.per_width[i]) / relaxed.width;
     t.relaxed = &relaxed;
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
@@ -211,7 +201,7 @@ template <class V, class N, int D> struct Contacts {
     touch(pair, i, t);
     V w[D];
     t.template slip<typename Pair::Support>(w);
-    const V stretch = V(candidates.width[i]), part = stretch / max(sqrt(dot<D>(w, w)), stretch);
+    const V part = V(1) / max(V(candidates.per_width[i]) * sqrt(dot<D>(w, w)), V(1));
     for (int j = 0; j < D; j++) w[j] = select(holds, part * w[j], V(0));
     Pair::Surface::to_own(candidates, i, w, kept);
   }

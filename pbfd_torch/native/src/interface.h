@@ -15,8 +15,11 @@ PBFD_FUNCTION const char* pbfd_target();
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
   int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, anchors, planes, solids, samples, forms, pushes;
+  int varied;  // numbers of which each world has its own: others than μ in space only, and not of BDF2
   const int* whole;
   const void* real;
+  const void* sample;  // of terrain and meshes
+  const int* which;    // [varied] of `real`, in order
 };
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
@@ -39,7 +42,7 @@ struct pbfd_steps {
   void* residual_norm;
   int* counted[4];
   int* fallbacks;
-  const void* grip;  // μ of the candidates, [worlds, candidates]; null: the plan's
+  const void* own;   // [worlds, varied] the worlds' own numbers
   void* trial[7];    // of starts: room for what their trial is given but q, and for what it finds, of `Positions`
 };
 
@@ -59,15 +62,15 @@ PBFD_FUNCTION void pbfd_start_implicit_euler(const pbfd_plan*, const pbfd_steps*
 PBFD_FUNCTION void pbfd_start_bdf2(const pbfd_plan*, const pbfd_steps*, void* room);
 
 // What a record lists beside what a plan in space knows.
-//   carrier: node of each link, −1: it rides on the world; frame: [links, 12] rotation and position, row by row, of the links there;
-//   slot: the place of each of the plan's candidates among all `slots` of a row of contacts; danger: its number among the dangers;
-//   first_limit: that of the first dof's limit, −1: there are none; mass: [1] of all links;
-//   of what rides on the world: still_moment [3], Σ m x; still_energy [1]; still_strain [1] and still_suspect, of the candidate there
-//   that is deepest beyond its measure and its number, −∞: there is none.
+//   carrier: node of each link, −1: it rides on the world; slot: the place of each of the plan's candidates among all `slots` of a
+//   row of contacts; danger: its number among the dangers; first_limit: that of the first dof's limit, −1: there are none;
+//   real: [12 · links + 7], of each world if it is their `own`, else of all: frames of the links where they are, rotation and
+//   position [3 × 4], row by row; the mass of all links; and of what rides on the world Σ m x [3], its energy, and the strain of the
+//   candidate there that is deepest beyond its measure, −∞: there is none, and its number.
 struct pbfd_roster {
-  int links, slots, first_limit, still_suspect;
+  int links, slots, first_limit, own;
   const int *carrier, *slot, *danger;
-  const void *frame, *mass, *still_moment, *still_energy, *still_strain;
+  const void* real;
 };
 
 // The record of steps `first` … `last` − 1 of all steps of all worlds that have been made, where world w makes its steps w,
@@ -82,7 +85,7 @@ struct pbfd_record {
   const void* given[10];
   const void* found[10];
   const int* hazards;
-  const void* grip;
+  const void* own;  // see pbfd_steps
   void *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;
   void *contact_depth, *contact_point, *contact_normal, *contact_force, *contact_slip;
   int* suspect;

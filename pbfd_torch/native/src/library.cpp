@@ -10,7 +10,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 6; }
+int pbfd_interface() { return 7; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -29,21 +29,59 @@ template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* gi
 
 Rules rules(const pbfd_plan* p, const pbfd_steps* s) { return {s->dt, s->tolerance, s->surplus, s->share, s->jump, p->halvings, s->evaluations}; }
 
+template <class N, int D> Plan<N, D> plan_of(const pbfd_plan* p, const N* numbers) {
+  return {sizes(p), p->whole, numbers, static_cast<const typename Kind<N>::Scalar*>(p->sample)};
+}
+
+template <class V> Numbers<V> numbers_of(const pbfd_plan* p, const void* own, int first, int count, Arena<V>& arena) {
+  using T = typename Kind<V>::Scalar;
+  return {static_cast<const T*>(p->real), first, count, p->varied, p->which, static_cast<const T*>(own), arena};
+}
+
+// make(plan, numbers, μ, arena) with a plan whose numbers are lanes: any may be of its own for each world.
+template <class V, int D, class F> void with_each(const pbfd_plan* p, const void* rows, Arena<V> arena, F&& make) {
+  Numbers<V> own = numbers_of(p, rows, 0, Plan<V, D>::real_numbers(sizes(p)), arena);
+  const Plan<V, D> plan = plan_of<V, D>(p, own.lanes);
+  make(plan, own, plan.contact.grip, arena);
+}
+
+// The same; worlds that differ by their μ, if at all, share a plan: there is less to be read. EACH: whether there are others.
+template <class V, int D, bool EACH, class F> void with_several(const pbfd_plan* p, const void* rows, Arena<V> arena, F&& make) {
+  using T = typename Kind<V>::Scalar;
+  const T* real = static_cast<const T*>(p->real);
+  const Plan<T, D> plan = plan_of<T, D>(p, real);
+  [[maybe_unused]] const int first = int(plan.contact.grip - real), end = first + p->candidates;
+  if constexpr (EACH)
+    if (p->varied && (p->which[0] < first || p->which[p->varied - 1] >= end)) return with_each<V, D>(p, rows, arena, make);
+  Numbers<V> own = numbers_of(p, rows, first, p->candidates, arena);
+  make(plan, own, static_cast<const V*>(own.lanes), arena);
+}
+
+// Of worlds that differ by more than their μ the core makes steps in space only, and not those of BDF2: the library is to be built
+// in a minute or two.
+template <template <class, class, int> class> constexpr bool apart = true;
+template <> constexpr bool apart<Bdf2> = false;
+
 // Steps of a scheme, and starts.
 template <template <class, class, int> class Scheme> struct Going {
-  template <class V, class T, int D>
-  static void make(const Plan<T, D>& plan, const pbfd_plan* p, const pbfd_steps* s, Arena<V> arena) {
-    Machine<V, T, D, Scheme<V, T, D>> machine(plan, arena);
-    machine.newton.balance.contacts.own_grip = static_cast<const T*>(s->grip);
-    machine.run(journey<T>(s, s->given, s->found), rules(p, s), s->first, s->last);
+  static constexpr bool differing = apart<Scheme>;
+  template <class V, class N, int D>
+  static void make(const pbfd_plan* p, const pbfd_steps* s, const Plan<N, D>& plan, Numbers<V>& own, const V* grip,
+                   Arena<V>& arena) {
+    Machine<V, N, D, Scheme<V, N, D>> machine(plan, own, arena);
+    machine.newton.balance.contacts.grip = grip;
+    machine.run(journey<typename Kind<V>::Scalar>(s, s->given, s->found), rules(p, s), s->first, s->last);
   }
 };
 
 template <template <class, class, int> class Scheme> struct Starting {
-  template <class V, class T, int D>
-  static void make(const Plan<T, D>& plan, const pbfd_plan* p, const pbfd_steps* s, Arena<V> arena) {
-    Starts<V, T, D, Scheme<V, T, D>> starts(plan, arena);
-    starts.balance.contacts.own_grip = static_cast<const T*>(s->grip);
+  static constexpr bool differing = apart<Scheme>;
+  template <class V, class N, int D>
+  static void make(const pbfd_plan* p, const pbfd_steps* s, const Plan<N, D>& plan, Numbers<V>& own, const V* grip,
+                   Arena<V>& arena) {
+    using T = typename Kind<V>::Scalar;
+    Starts<V, N, D, Scheme<V, N, D>> starts(plan, own, arena);
+    starts.balance.contacts.grip = grip;
     const void* before[] = {s->given[0], s->trial[0], s->trial[1], s->trial[2]};
     Rules trial = rules(p, s);
     trial.share = 1;
@@ -54,21 +92,24 @@ template <template <class, class, int> class Scheme> struct Starting {
 template <class T, int D>
 void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   auto row = [](const void* array, long world, int count) { return static_cast<const T*>(array) + world * count; };
-  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
-  for (int w = s->first; w < s->last; w++)
-    inspect(plan, s->grip ? row(s->grip, w, p->candidates) : nullptr, p->anchors ? row(s->given[9], w, 3 * p->anchors) : nullptr,
-            row(s->given[0], w, p->nq), row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt), Arena<T>{static_cast<T*>(room)}, static_cast<T*>(residual) + long(w) * p->nv,
-            static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
+  with_each<T, D>(p, s->own, {static_cast<T*>(room)}, [&](const Plan<T, D>& plan, Numbers<T>& own, const T*, Arena<T>& arena) {
+    for (int w = s->first; w < s->last; w++) {
+      own.load(0, w);
+      inspect(plan, p->anchors ? row(s->given[9], w, 3 * p->anchors) : nullptr, row(s->given[0], w, p->nq),
+              row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt), arena,
+              static_cast<T*>(residual) + long(w) * p->nv, static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
+    }
+  });
 }
 
 // A single world is spared the work of lanes that nobody needs.
 template <class What, class T, int D> void make_of(const pbfd_plan* p, const pbfd_steps* s, void* room) {
-  using Several = Lanes<T, register_bytes / int(sizeof(T))>;
-  const Plan<T, D> plan(sizes(p), p->whole, static_cast<const T*>(p->real));
+  using V = Lanes<T, register_bytes / int(sizeof(T))>;
+  auto make = [&](auto& plan, auto& own, auto* grip, auto& arena) { What::make(p, s, plan, own, grip, arena); };
   if (s->last - s->first == 1)
-    What::make(plan, p, s, Arena<T>{static_cast<T*>(room)});
+    with_each<T, D>(p, s->own, {static_cast<T*>(room)}, make);
   else
-    What::make(plan, p, s, Arena<Several>{static_cast<Several*>(room)});
+    with_several<V, D, D == 3 && What::differing>(p, s->own, {static_cast<V*>(room)}, make);
 }
 
 template <class What> void in_space(const pbfd_plan* p, const pbfd_steps* s, void* room) {
@@ -82,22 +123,30 @@ template <class What> void make_by(const pbfd_plan* p, const pbfd_steps* s, void
     p->bytes == 8 ? make_of<What, double, 2>(p, s, room) : make_of<What, float, 2>(p, s, room);
 }
 
+template <template <class, class, int> class Scheme> struct Recording {
+  template <class V, class N>
+  static void make(const pbfd_roster* r, const pbfd_record* a, const Plan<N, 3>& plan, Numbers<V>& own, const V* grip,
+                   Arena<V>& arena) {
+    using T = typename Kind<V>::Scalar;
+    auto out = [](void* array) { return static_cast<T*>(array); };
+    const Roster<T> roster{r->links, r->slots, r->first_limit, r->own != 0,
+                           r->carrier, r->slot, r->danger, static_cast<const T*>(r->real)};
+    const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, out(a->q), out(a->v), out(a->link_poses),
+                           out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
+                           out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
+                           out(a->contact_force), out(a->contact_slip), a->suspect};
+    Recorder<V, N, Scheme<V, N, 3>> recorder(plan, own, roster, arena);
+    recorder.balance.contacts.grip = grip;
+    recorder.write(record, a->first, a->last);
+  }
+};
+
 template <template <class, class, int> class Scheme, class T>
 void record_of(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   using V = Lanes<T, register_bytes / int(sizeof(T))>;
-  auto real = [](const void* array) { return static_cast<const T*>(array); };
-  auto out = [](void* array) { return static_cast<T*>(array); };
-  Arena<V> arena{static_cast<V*>(room)};
-  const Plan<T, 3> plan(sizes(p), p->whole, real(p->real));
-  const Roster<T> roster{r->links, r->slots, r->first_limit, r->still_suspect, r->carrier, r->slot, r->danger, real(r->frame),
-                         real(r->mass), real(r->still_moment), real(r->still_energy), real(r->still_strain)};
-  const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, out(a->q), out(a->v), out(a->link_poses),
-                         out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
-                         out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
-                         out(a->contact_force), out(a->contact_slip), a->suspect};
-  Recorder<V, T, Scheme<V, T, 3>> recorder(plan, roster, arena);
-  recorder.balance.contacts.own_grip = real(a->grip);
-  recorder.write(record, a->first, a->last);
+  with_several<V, 3, apart<Scheme>>(p, a->own, {static_cast<V*>(room)}, [&](auto& plan, auto& own, auto* grip, auto& arena) {
+    Recording<Scheme>::make(r, a, plan, own, grip, arena);
+  });
 }
 
 template <template <class, class, int> class Scheme>
@@ -107,13 +156,13 @@ void record_by(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, v
 
 // Room for lanes V, in V; a plane needs less.
 template <class V> int room_of(Sizes s) {
-  using T = typename Kind<V>::Scalar;
-  using First = EnergyMomentum<V, T, 3>;
-  using Second = ImplicitEuler<V, T, 3>;
-  using Third = Bdf2<V, T, 3>;
-  return std::max({Machine<V, T, 3, First>::room(s), Machine<V, T, 3, Second>::room(s), Machine<V, T, 3, Third>::room(s),
-                   Starts<V, T, 3, First>::room(s), Starts<V, T, 3, Second>::room(s), Starts<V, T, 3, Third>::room(s),
-                   Recorder<V, T, First>::room(s), Recorder<V, T, Second>::room(s), Recorder<V, T, Third>::room(s)});
+  using First = EnergyMomentum<V, V, 3>;
+  using Second = ImplicitEuler<V, V, 3>;
+  using Third = Bdf2<V, V, 3>;
+  return Plan<V, 3>::real_numbers(s) +
+         std::max({Machine<V, V, 3, First>::room(s), Machine<V, V, 3, Second>::room(s), Machine<V, V, 3, Third>::room(s),
+                   Starts<V, V, 3, First>::room(s), Starts<V, V, 3, Second>::room(s), Starts<V, V, 3, Third>::room(s),
+                   Recorder<V, V, First>::room(s), Recorder<V, V, Second>::room(s), Recorder<V, V, Third>::room(s)});
 }
 
 }  // namespace

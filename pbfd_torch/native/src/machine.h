@@ -29,6 +29,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   static constexpr int W = Kind<V>::lanes;
 
   const Plan<N, D>& plan;
+  Numbers<V>& own;  // of the worlds in the lanes
   Newton<V, N, D> newton;
   Sight<V, N, D> sight;
   Scheme scheme;
@@ -38,8 +39,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
   static int room(Sizes s) {
     return Newton<V, N, D>::room(s) + Sight<V, N, D>::room(s) + Scheme::room(s) + 4 * room_for<State>(s) + 3 * s.nq + s.nv;
   }
-  Machine(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
+  Machine(const Plan<N, D>& scene, Numbers<V>& numbers, Arena<V>& arena)
+      : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
     newton.balance.contacts.behind = before.behind;
@@ -48,6 +49,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
 
   // All steps of worlds first … last − 1. Those that remain unsolved go on from the best that was found.
   void run(const Journey<T>& to, const Rules& asked, int first, int last) {
+    if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
     newton.running = eased = M(false);
@@ -289,7 +291,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     for (int j = 0; j < plan.nu; j++) put(newton.balance.control[j], i, journey->control[row * plan.nu + j]);
   }
   void load(int i, int from) {
-    newton.balance.contacts.load(i, from);
+    if (own.varied) own.load(i, from), plainly[i] = false;  // θ may be another
     int k = 0;
     State::each(plan, [&](auto member, int width) {
       const T* array = static_cast<const T*>(journey->given[k++]) + long(from) * width;

@@ -27,18 +27,19 @@ template <class V, class N, int D = 3> struct Newton {
   V tolerance, most;  // ‖r/scale‖; evaluations
   // where every lane stands
   V *q, *trial, *retreat, *direction, *step, *column, *diagonal;
-  V *allowed, *factors;  // 1 / (scale + rounding/tolerance) of each residual; of J or of the stiffness
+  V *plain, *allowed;  // of each residual: 1 / scale, 1 / (scale + rounding/tolerance)
+  V* factors;          // of J or of the stiffness
   V length, start_work, low, low_work, low_curve, high, high_work, high_curve;
   V error, status, evaluations, iterations, far;
   M running, at_guess, at_retreat, searching;
   bool settled;  // every lane that does not run has been evaluated where it stays
 
-  static int room(Sizes s) { return Balance<V, N, D>::room(s) + Outlook<V, N, D>::room(s) + 3 * s.nq + (5 + s.nv) * s.nv; }
+  static int room(Sizes s) { return Balance<V, N, D>::room(s) + Outlook<V, N, D>::room(s) + 3 * s.nq + (6 + s.nv) * s.nv; }
 
   Newton(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), balance(scene, arena), outlook(scene, arena) {
     q = arena.take(plan.nq), trial = arena.take(plan.nq), retreat = arena.take(plan.nq);
     direction = arena.take(plan.nv), step = arena.take(plan.nv), column = arena.take(plan.nv), diagonal = arena.take(plan.nv);
-    allowed = arena.take(plan.nv), factors = arena.take(plan.nv * plan.nv);
+    plain = arena.take(plan.nv), allowed = arena.take(plan.nv), factors = arena.take(plan.nv * plan.nv);
     for (int i = 0; i < plan.nv; i++) direction[i] = V(0);
     length = start_work = low = low_work = low_curve = high = high_work = high_curve = V(0);
     error = status = evaluations = iterations = V(0), far = V(1);
@@ -55,8 +56,10 @@ template <class V, class N, int D = 3> struct Newton {
     for (int i = 0; i < D * plan.nodes; i++) farthest = max(farthest, abs(balance.start.position[i]));
     far = select(which, farthest + V(plan.reach[0]), far);
     const V per = V(8 * EPSILON) * balance.weight / tolerance;
-    for (int i = 0; i < plan.nv; i++)
+    for (int i = 0; i < plan.nv; i++) {
+      plain[i] = V(1) / V(plan.scale[i]);
       allowed[i] = V(1) / fma(per, fma(far, V(plan.heft[i]), V(plan.armature[i])), V(plan.scale[i]));
+    }
     running = running | which, searching = searching & !which;
     at_guess = (at_guess & !which) | (which & safe), at_retreat = (at_retreat & !which) | (which & !safe);
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
@@ -110,7 +113,7 @@ template <class V, class N, int D = 3> struct Newton {
     const int n = plan.nv;
     V whole(0), strict(0);
     for (int i = 0; i < n; i++) {
-      const V r = balance.residual[i], a = r * V(N(1) / plan.scale[i]), b = r * allowed[i];
+      const V r = balance.residual[i], a = r * plain[i], b = r * allowed[i];
       whole = fma(a, a, whole), strict = fma(b, b, strict);
     }
     const V least = tolerance * V(1 / NEGLIGIBLE) * sqrt(whole);

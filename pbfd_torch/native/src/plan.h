@@ -45,7 +45,7 @@ template <class N, int D = 3> struct Plan : Sizes {
   const N *limit_release, *limit_per_force, *dry_speed;
 
   Plan() = default;
-  Plan(Sizes sizes, const int* ints, const N* numbers) : Sizes(sizes) {
+  Plan(Sizes sizes, const int* ints, const N* numbers, const typename Kind<N>::Scalar* samples) : Sizes(sizes) {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
     parent = whole(nodes), kind = whole(nodes), q = whole(nodes), v = whole(nodes), plain = whole(nodes);
@@ -59,7 +59,7 @@ template <class N, int D = 3> struct Plan : Sizes {
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
     least_control = real(nu), most_control = real(nu), least_force = real(nu), most_force = real(nu);
     gravity = real(D), reach = real(1), limit_release = real(1), limit_per_force = real(1), dry_speed = real(1);
-    contact = Candidates<N, D>(*this, ints, numbers);
+    contact = Candidates<N, D>(*this, ints, numbers, samples);
     pushed = whole(pushes), push_point = real(3 * pushes), push = real(3 * pushes);
   }
 
@@ -77,6 +77,25 @@ template <class V> struct Arena {
     V* here = next;
     next += count;
     return here;
+  }
+};
+
+// Numbers of a plan, from `first` on, as the worlds in the lanes have them: what all worlds share, but for some, of which each world
+// has a row of its own.
+template <class V> struct Numbers {
+  using T = typename Kind<V>::Scalar;
+  int first, varied;
+  const int* which;  // [varied] of all numbers of the plan
+  const T* rows;     // [worlds, varied]
+  V* lanes;
+
+  Numbers(const T* real, int from, int count, int differing, const int* these, const T* own, Arena<V>& arena)
+      : first(from), varied(differing), which(these), rows(own), lanes(arena.take(count)) {
+    for (int j = 0; j < count; j++) lanes[j] = V(real[first + j]);
+  }
+  // A lane takes a world.
+  void load(int i, int world) {
+    for (int j = 0; j < varied; j++) put(lanes[which[j] - first], i, rows[long(world) * varied + j]);
   }
 };
 

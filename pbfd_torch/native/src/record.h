@@ -18,10 +18,19 @@ template <class T> struct Record {
 };
 
 // The links, the slots of contacts and the dangers that a record lists, and what rides on the world: arrays as interface.h has them.
-template <class N> struct Roster {
-  int links, slots, first_limit, still_suspect;
+template <class T> struct Roster {
+  int links, slots, first_limit;
+  bool own;
   const int *carrier, *slot, *danger;
-  const N *frame, *mass, *still_moment, *still_energy, *still_strain;
+  const T* real;
+
+  // Of `real`: after the links' frames.
+  int numbers() const { return 12 * links + 7; }
+  int mass() const { return 12 * links; }
+  int still_moment() const { return 12 * links + 1; }
+  int still_energy() const { return 12 * links + 4; }
+  int still_strain() const { return 12 * links + 5; }
+  int still_suspect() const { return 12 * links + 6; }
 };
 
 template <class V, class N, class Scheme> struct Recorder {
@@ -31,21 +40,22 @@ template <class V, class N, class Scheme> struct Recorder {
   static constexpr int W = Kind<V>::lanes, D = 3;
 
   const Plan<N, D>& plan;
-  const Roster<N>& roster;
+  Numbers<V>& own;  // of the worlds in the lanes
+  const Roster<T>& roster;
   Balance<V, N, D> balance;
   Scheme scheme;
   State before, after;
   V *velocity, *rates, *rest, *gap, *guess;
+  int world[W];  // in each lane
 
   static int room(Sizes s) {
     return Balance<V, N, D>::room(s) + Scheme::room(s) + 2 * room_for<State>(s) + 12 * s.nodes + 2 * s.nv + 2 * s.nq;
   }
-  Recorder(const Plan<N, D>& scene, const Roster<N>& listed, Arena<V>& arena)
-      : plan(scene), roster(listed), balance(plan, arena), scheme(plan, arena) {
+  Recorder(const Plan<N, D>& scene, Numbers<V>& numbers, const Roster<T>& listing, Arena<V>& arena)
+      : plan(scene), own(numbers), roster(listing), balance(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     velocity = arena.take(plan.nv), rates = arena.take(12 * plan.nodes), gap = arena.take(plan.nv);
     rest = arena.take(plan.nq), guess = arena.take(plan.nq);
-    for (int i = 0; i < plan.nq; i++) rest[i] = V(plan.rest[i]);
   }
 
   // Of steps first … last − 1 of all steps of all worlds.
@@ -68,7 +78,8 @@ template <class V, class N, class Scheme> struct Recorder {
 
   // Between a lane and the arrays.
   void load(int i, int step) {
-    balance.contacts.load(i, step % record->worlds);
+    world[i] = step % record->worlds;
+    if (own.varied) own.load(i, world[i]);
     const bool begins = step < record->worlds;
     const long earlier = begins ? step : step - record->worlds;
     int k = 0;
@@ -78,6 +89,13 @@ template <class V, class N, class Scheme> struct Recorder {
       for (int j = 0; j < width; j++) put((after.*member)[j], i, end[j]), put((before.*member)[j], i, start[j]);
       k++;
     });
+  }
+  // One of the roster's numbers, as the worlds in the lanes have it.
+  V listed(int j) const {
+    if (!roster.own) return V(roster.real[j]);
+    V x(0);
+    for (int i = 0; i < W; i++) put(x, i, roster.real[long(world[i]) * roster.numbers() + j]);
+    return x;
   }
   // values [width], at a place in each step's row.
   void store(T* array, const V* values, int width, int row, int place = 0) const {
@@ -92,8 +110,8 @@ template <class V, class N, class Scheme> struct Recorder {
     scheme.speeds(after, balance.now, balance.axes, velocity, balance.dt, rates);
     V center[D], linear[D], angular[D], levered[D], rotors(0);
     sum_up(center, linear, angular);
-    const V potential = stored(center), per_mass = V(N(1) / roster.mass[0]);
-    for (int i = 0; i < D; i++) center[i] = per_mass * (center[i] + V(roster.still_moment[i]));
+    const V potential = stored(center), per_mass = V(1) / listed(roster.mass());
+    for (int i = 0; i < D; i++) center[i] = per_mass * (center[i] + listed(roster.still_moment() + i));
     cross(center, linear, levered);
     for (int i = 0; i < D; i++) angular[i] = angular[i] - levered[i];
     for (int i = 0; i < plan.nv; i++) rotors = fma(V(plan.armature[i]) * velocity[i], velocity[i], rotors);
@@ -125,13 +143,14 @@ template <class V, class N, class Scheme> struct Recorder {
 
   // Of gravity, springs, limits and the contacts' normal forces; `first`: the bodies' first moment.
   V stored(const V* first) {
-    V sum = V(roster.still_energy[0]);
+    V sum = listed(roster.still_energy());
     for (int i = 0; i < D; i++) sum = fma(-V(plan.gravity[i]), first[i], sum);
+    for (int i = 0; i < plan.nq; i++) rest[i] = V(plan.rest[i]);
     difference(plan, rest, after.q, gap);
-    for (int i = 0; i < plan.nv; i++) sum = fma(V(N(0.5) * plan.spring[i]) * gap[i], gap[i], sum);
+    for (int i = 0; i < plan.nv; i++) sum = fma(V(0.5) * V(plan.spring[i]) * gap[i], gap[i], sum);
     each_limit(plan, after.q, [&](int i, V past) {
       const V x = max(past, V(0));
-      sum = fma(V(plan.limit[i] / N(3)), x * x * x, sum);
+      sum = fma(V(plan.limit[i]) / V(3), x * x * x, sum);
     });
     each_kind(plan.contact, [&](auto pair, int from, int to) {
       for (int i = from; i < to; i++) sum += balance.contacts.stored(pair, i);
@@ -141,18 +160,18 @@ template <class V, class N, class Scheme> struct Recorder {
 
   // A link's pose [3 × 4]; one without a node rides on the world.
   void show(int link) const {
-    const N* frame = roster.frame + 12 * link;
     const int k = roster.carrier[link];
-    V pose[12];
+    V frame[12], pose[12];
+    for (int i = 0; i < 12; i++) frame[i] = listed(12 * link + i);
     for (int i = 0; i < D; i++)
       for (int j = 0; j < 4; j++) {
         if (k < 0) {
-          pose[4 * i + j] = V(frame[4 * i + j]);
+          pose[4 * i + j] = frame[4 * i + j];
           continue;
         }
         const V* R = balance.now.rotation + D * D * k + D * i;
         V sum = j == D ? balance.now.position[D * k + i] : V(0);
-        for (int a = 0; a < D; a++) sum = fma(R[a], V(frame[4 * a + j]), sum);
+        for (int a = 0; a < D; a++) sum = fma(R[a], frame[4 * a + j], sum);
         pose[4 * i + j] = sum;
       }
     store(record->link_poses, pose, 12, 12 * roster.links, 12 * link);
@@ -163,11 +182,11 @@ template <class V, class N, class Scheme> struct Recorder {
     Contacts<V, N, D>& contacts = balance.contacts;
     scheme.begin(balance, before, guess, M(false));
     contacts.begin(balance.start, balance.target, balance.dt);
-    V worst = V(roster.still_strain[0]), number = V(N(roster.still_suspect));
+    V worst = listed(roster.still_strain()), number = listed(roster.still_suspect());
     auto strained = [&](V share, int danger) {  // of those strained alike, the first
-      const V own = V(N(danger));
-      const M more = (share > worst) | ((share >= worst) & (own < number));
-      worst = select(more, share, worst), number = select(more, own, number);
+      const V this_one = V(T(danger));
+      const M more = (share > worst) | ((share >= worst) & (this_one < number));
+      worst = select(more, share, worst), number = select(more, this_one, number);
     };
     each_kind(plan.contact, [&](auto pair, int from, int to) {
       for (int i = from; i < to; i++) {

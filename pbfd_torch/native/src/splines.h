@@ -39,13 +39,13 @@ template <int ORDER, class V> struct Basis {
 };
 
 // Partial derivatives of a spline over the plane, D[a][b] = ∂ᵃ₁ ∂ᵇ₂, a + b ≤ ORDER.
-template <int ORDER, class V, class N>
-inline void spline(const N* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, V D[][ORDER + 1]) {
+template <int ORDER, class V>
+inline void spline(const typename Kind<V>::Scalar* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, V D[][ORDER + 1]) {
   V values[16], columns[4];
   for (int i = 0; i < Kind<V>::lanes; i++) {
     int rows[4], places[4];
     x.nodes(i, size[0], rows), y.nodes(i, size[1], places);
-    for (int j = 0; j < 16; j++) put(values[j], i, lane(sample[rows[j / 4] * size[1] + places[j % 4]], i));
+    for (int j = 0; j < 16; j++) put(values[j], i, sample[rows[j / 4] * size[1] + places[j % 4]]);
   }
   for (int a = 0; a <= ORDER; a++) {
     for (int k = 0; k < 4; k++) columns[k] = x.along(a, values + k, 4);
@@ -54,16 +54,16 @@ inline void spline(const N* sample, const int* size, const Basis<ORDER, V>& x, c
 }
 
 // The same over space, D[a][b][c].
-template <int ORDER, class V, class N>
+template <int ORDER, class V>
 inline void spline(
-    const N* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, const Basis<ORDER, V>& z,
+    const typename Kind<V>::Scalar* sample, const int* size, const Basis<ORDER, V>& x, const Basis<ORDER, V>& y, const Basis<ORDER, V>& z,
     V D[][ORDER + 1][ORDER + 1]) {
   V values[64], sheets[16], columns[4];
   for (int i = 0; i < Kind<V>::lanes; i++) {
     int rows[4], lines[4], places[4];
     x.nodes(i, size[0], rows), y.nodes(i, size[1], lines), z.nodes(i, size[2], places);
     for (int j = 0; j < 64; j++)
-      put(values[j], i, lane(sample[(rows[j / 16] * size[1] + lines[j / 4 % 4]) * size[2] + places[j % 4]], i));
+      put(values[j], i, sample[(rows[j / 16] * size[1] + lines[j / 4 % 4]) * size[2] + places[j % 4]]);
   }
   for (int a = 0; a <= ORDER; a++) {
     for (int k = 0; k < 16; k++) sheets[k] = x.along(a, values + k, 16);

@@ -11,6 +11,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
   static constexpr int W = Kind<V>::lanes;
 
   const Plan<N, D>& plan;
+  Numbers<V>& own;  // of the worlds in the lanes
   Machine<V, N, D, ImplicitEuler<V, N, D>> machine;
   Balance<V, N, D>& balance;
   Momenta<V, N, D> momenta;
@@ -24,8 +25,8 @@ template <class V, class N, int D, class Scheme> struct Starts {
     return Machine<V, N, D, ImplicitEuler<V, N, D>>::room(s) + Momenta<V, N, D>::room(s) + room_for<Positions<V>>(s) +
            room_for<typename Scheme::State>(s) + s.nq + 7 * s.nv + 24 * s.nodes;
   }
-  Starts(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), machine(scene, arena), balance(machine.newton.balance), momenta(scene, arena) {
+  Starts(const Plan<N, D>& scene, Numbers<V>& numbers, Arena<V>& arena)
+      : plan(scene), own(numbers), machine(scene, own, arena), balance(machine.newton.balance), momenta(scene, arena) {
     before = taken<Positions<V>>(arena, plan), begun = taken<typename Scheme::State>(arena, plan);
     end = arena.take(plan.nq), v = arena.take(plan.nv), force = arena.take(plan.nv), acceleration = arena.take(plan.nv);
     rough = arena.take(plan.nv), smooth = arena.take(plan.nv), sum = arena.take(plan.nv), spare = arena.take(plan.nv);
@@ -52,7 +53,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
       take(q, plan.nq, before.q), take(speeds, plan.nv, v), take(back, plan.nq, before.q_previous);
       take(static_cast<const T*>(trial.found[0]), plan.nq, end), take(trial.control, plan.nu, balance.control);
       M solved;
-      for (int i = 0; i < W; i++) balance.contacts.load(i, world(i)), put(solved, i, trial.status[world(i)] <= HALVED);
+      for (int i = 0; i < W; i++) put(solved, i, trial.status[world(i)] <= HALVED);
       feel(solved), complete(solved, begun);
       int k = 0;
       Scheme::State::each(plan, [&](auto member, int width) { give(begun.*member, width, static_cast<T*>(found[k++])); });
@@ -63,7 +64,10 @@ template <class V, class N, int D, class Scheme> struct Starts {
   int block, beyond;  // its first world, and the one after the last of all
 
   template <class F> void each_block(int first, int last, F&& visit) {
-    for (block = first, beyond = last; block < last; block += W) visit();
+    for (block = first, beyond = last; block < last; block += W) {
+      for (int i = 0; own.varied && i < W; i++) own.load(i, int(world(i)));
+      visit();
+    }
   }
   // Lanes that nobody needs compute too, with the numbers of some world.
   long world(int i) const { return block + i < beyond ? block + i : beyond - 1; }
