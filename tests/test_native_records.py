@@ -128,7 +128,7 @@ def test_a_state_that_is_not_finite() -> None:
     assert bool(found.potential_energy[:, 3].isfinite().all())
 
 
-COMPILED = [(solid, BALLS, Contact) for solid in SOLIDS]
+COMPILED: list[tuple[str, Sequence[Shape], type[Contact]]] = [(solid, BALLS, Contact) for solid in SOLIDS]
 COMPILED += [(solid, CURVED, CurvedContact) for solid in SOLIDS.keys() - CONVEX.keys()]
 
 
