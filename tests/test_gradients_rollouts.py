@@ -128,7 +128,7 @@ def test_values_are_the_same_to_the_bit(name: str) -> None:
     and its friction, with checkpoints and without."""
     setup = SCENES["chain-slope-drop"](worlds=2)
     v = setup.v + torch.tensor([[0.0], [0.3]], dtype=torch.float64)
-    plain = Simulator(setup.scene, 0.05, SMOOTH[name]())
+    plain = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=Torch())
     expected = plain.trajectory(plain.initial_state(setup.q, v), steps=9)
     names = ("articulation.pseudo_inertia", "terms.1.friction.mu")
     values = {n: x.clone().requires_grad_() for n, x in parameters(setup.scene).items() if n in names}
