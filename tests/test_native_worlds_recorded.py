@@ -39,7 +39,6 @@ from tests.test_native_worlds import (
     WORLDS,
     Difference,
     control,
-    differences_of,
     differing,
     drawn,
     heavier,
@@ -49,6 +48,7 @@ from tests.test_native_worlds import (
     start,
     state_of,
 )
+from tests.test_native_worlds_bits import differences_of
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
