@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.worlds import Worlds, replaced
-from pbfd_torch.tree.articulation import Articulation
+from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 ENTRIES = 12  # of a pose: rotation and position
 
@@ -42,14 +43,17 @@ class Seats:
     def of_nodes(self, history: Sequence[Tensor]) -> Tensor:
         """Poses of all links, each `[*batch, nlink, 4, 4]`, as those of the nodes, `[*batch, len(history) · nodes · ENTRIES]`."""
         links = torch.stack(tuple(history), -4)[..., self.link, :, :]
-        poses = links @ torch.linalg.inv(self.frame)[..., None, self.link, :, :]
+        poses = links @ self._back[..., None, self.link, :, :]
         return torch.cat((poses[..., :3, :3].flatten(-2), poses[..., :3, 3]), -1).flatten(-3)
 
     def of_links(self, history: Tensor, count: int) -> tuple[Tensor, ...]:
         """The same back: `count` times the poses of all links."""
         entries = history.unflatten(-1, (count, len(self.link), ENTRIES))
-        nodes = torch.cat((entries[..., :9].unflatten(-1, (3, 3)), entries[..., 9:, None]), -1)
-        world = torch.eye(4, dtype=nodes.dtype)[:3].expand(*nodes.shape[:-3], 1, 3, 4)
-        nodes = torch.cat((world, nodes), -3)
-        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=nodes.dtype).expand(*nodes.shape[:-2], 1, 4)
-        return (torch.cat((nodes, last), -2)[..., self.node, :, :] @ self.frame[..., None, :, :, :]).unbind(-4)
+        nodes = homogeneous(entries[..., :9].unflatten(-1, (3, 3)), entries[..., 9:])
+        world = torch.eye(4, dtype=nodes.dtype).expand(*nodes.shape[:-3], 1, 4, 4)
+        return (torch.cat((world, nodes), -3)[..., self.node, :, :] @ self.frame[..., None, :, :, :]).unbind(-4)
+
+    @cached_property
+    def _back(self) -> Tensor:
+        """Of each node on its link."""
+        return torch.linalg.inv(self.frame)

@@ -18,7 +18,7 @@ from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
-from pbfd_torch.native.plan_contact import Candidates, on_nodes
+from pbfd_torch.native.plan_contact import Candidates, joined, on_nodes
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
@@ -44,8 +44,8 @@ class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their μ: the core knows these in space only,
-    and not with BDF2. order: where the candidates are among those of all contact terms. anchors: how many
-    each contact has, in the order of a state's memory. seats: where links are on the nodes."""
+    and not with BDF2. order: where the candidates are among those of all contact terms. anchors: how many each contact has, in the
+    order of a state's memory. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -68,56 +68,106 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a stepper's scene, in a plane where it moves in one. Raises `NotCompiledError` naming what the core does not
     know."""
     _require_covered(stepper)
-    a = aligned(stepper.articulation)
-    known = _Terms(stepper, a)
-    held = known.pushed or not known.candidates.flat or isinstance(stepper.integrator, Bdf2)  # of which the core knows space only
-    space = _written(stepper, a, known, None)
-    if space.apart and isinstance(stepper.integrator, Bdf2):
+    parts, bdf2 = _parts(stepper), isinstance(stepper.integrator, Bdf2)
+    if parts.apart and bdf2:
         raise unknown("BDF2 of worlds that differ")
-    plane = None if held or space.apart else plane_of(a, [stepper.scene.gravity, *known.candidates.normals])
-    return space if plane is None else _written(stepper, a, known, plane)
+    if parts.apart or bdf2 or parts.pushed or not parts.candidates.flat:  # of which the core knows space only
+        return parts.plan()
+    plane = plane_of(parts.a, [parts.gravity, *parts.candidates.normals])
+    return (parts if plane is None else parts.within(plane)).plan()
 
 
 def planned_in_space(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a scene that the core knows, in space."""
+    return _parts(stepper).plan()
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What a plan is made of: nodes, gravity and candidates, of which a plane has its own, and what is the same in it. Numbers are
+    `[n]`, or `[*batch, n]` where worlds differ.
+
+    Attributes:
+        a: as `aligned` gives it. nodes: see `_nodes`. driven: coordinates and dofs of the actuators. pushed: nodes.
+        halvings: for how many there are shares. joints, scene, pushes: numbers, as src/plan.h has them.
+    """
+
+    a: Articulation
+    nodes: Sequence[Tensor]
+    gravity: Tensor
+    candidates: Candidates
+    driven: list[int]
+    pushed: list[int]
+    halvings: int
+    joints: Sequence[Tensor]
+    scene: Sequence[Tensor]
+    pushes: Sequence[Tensor]
+    dimension: int = 3
+
+    @property
+    def real(self) -> list[Tensor]:
+        """All numbers."""
+        nodes = (x.flatten(-rank) for x, rank in zip(self.nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True))
+        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes]
+
+    @property
+    def apart(self) -> bool:
+        """See `Plan`."""
+        grips = {id(x) for x in self.candidates.grips}
+        return any(x.ndim > 1 and id(x) not in grips for x in self.real)
+
+    def within(self, plane: MotionPlane) -> _Parts:
+        """The same in a plane."""
+        nodes, candidates = plane.nodes(self.a, self.nodes), self.candidates.within(plane)
+        return replaced(self, nodes=nodes, candidates=candidates, gravity=self.gravity @ plane.basis, dimension=2)
+
+    def plan(self) -> Plan:
+        """All of it."""
+        a, t, candidates = self.a, self.a.topology, self.candidates
+        sizes = zip(t.joint_sizes, t.joint_is_hinge, strict=True)
+        kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in sizes]
+        whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
+        whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed
+        real, which, own = _told_apart(self.real)
+        return Plan(
+            sizes=(t.njoint, t.nq, t.nv, len(self.driven) // 2, self.halvings, *candidates.sizes, len(self.pushed)),
+            whole=torch.tensor(whole, dtype=torch.int32),
+            real=real,
+            which=which,
+            own=own,
+            sample=torch.cat([a.rest.new_empty(0), *candidates.samples]),
+            dimension=self.dimension,
+            apart=self.apart,
+            order=candidates.order,
+            anchors=tuple(candidates.anchors),
+            seats=Seats.of(a),
+        )
+
+
+def _parts(stepper: EagerStepper[Any]) -> _Parts:
+    """Those of a stepper's scene, in space. Raises `NotCompiledError`."""
     a = aligned(stepper.articulation)
-    return _written(stepper, a, _Terms(stepper, a), None)
-
-
-def _written(stepper: EagerStepper[Any], a: Articulation, known: _Terms, plane: MotionPlane | None) -> Plan:
-    t = a.topology
-    kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in zip(t.joint_sizes, t.joint_is_hinge, strict=True)]
-    whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
-    act, candidates = known.actuators, known.candidates
-    nodes, gravity = _nodes(a), stepper.scene.gravity
-    if plane is not None:
-        nodes, candidates, gravity = plane.nodes(a, nodes), candidates.within(plane), gravity @ plane.basis
-    whole += _plain(nodes[0]) + _above(a)
-    nu = 0
-    driven: list[Tensor] = []
-    if act is not None:
-        nu = act.nu
-        whole += act.coordinate.tolist() + act.dof.tolist()
-        ranges = [*act.control_range.unbind(-1), *act.force_range.unbind(-1)]
-        driven = [act.gear, act.gain, act.bias, act.stiffness, act.damping, *ranges]
-    whole += candidates.whole() + known.pushed
+    t, known = a.topology, _Terms(stepper, a)
     shares = _shares(stepper, known.share)
-    speeds = [known.limit_release, known.limit_per_force, known.dry_speed]
-    real = [
-        *(x.flatten(-rank) for x, rank in zip(nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True)),
-        *(_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), *shares),
-        *(known.spring, known.damping, known.armature, known.dry, a.lower, a.upper, known.limit, known.rest),
-        *driven,
-        *(gravity, reach(a)[..., None], a.rest.new_tensor(speeds)),
-        *candidates.real(),
-        *(x[k].flatten(-2) for k in range(2) for x in known.pushes),
-    ]
-    sizes = (t.njoint, t.nq, t.nv, nu, len(shares) - 1, *candidates.sizes, len(known.pushed))
-    sample = torch.cat([a.rest.new_empty(0), *candidates.samples])
-    grips = {id(x) for x in candidates.grips}
-    apart = any(x.ndim > 1 and id(x) not in grips for x in real)
-    told = (*_told_apart(real), sample, 3 if plane is None else 2, apart)
-    return Plan(sizes, torch.tensor(whole, dtype=torch.int32), *told, candidates.order, tuple(candidates.anchors), Seats.of(a))
+    joints = [_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), *shares]
+    joints += [known.spring, known.damping, known.armature, known.dry, a.lower, a.upper, known.limit, known.rest]
+    driven: list[int] = []
+    if (act := known.actuators) is not None:
+        driven = act.coordinate.tolist() + act.dof.tolist()
+        joints += [act.gear, act.gain, act.bias, act.stiffness, act.damping]
+        joints += [*act.control_range.unbind(-1), *act.force_range.unbind(-1)]
+    return _Parts(
+        a=a,
+        nodes=_nodes(a),
+        gravity=stepper.scene.gravity,
+        candidates=known.candidates,
+        driven=driven,
+        pushed=known.pushed,
+        halvings=len(shares) - 1,
+        joints=joints,
+        scene=[reach(a)[..., None], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
+        pushes=[x[k].flatten(-2) for k in range(2) for x in known.pushes],
+    )
 
 
 def _told_apart(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -125,8 +175,7 @@ def _told_apart(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     the worlds have of their own, and these."""
     ends = list(itertools.accumulate(x.shape[-1] for x in pieces))
     some = [(x, range(end - x.shape[-1], end)) for x, end in zip(pieces, ends, strict=True) if x.ndim > 1]
-    batch = torch.broadcast_shapes(*(x.shape[:-1] for x, _ in some))
-    own = torch.cat([pieces[0].new_empty(*batch, 0), *(x.expand(*batch, -1) for x, _ in some)], -1)
+    own = joined(pieces[0].new_empty(0), *(x for x, _ in some))
     first = [x if x.ndim == 1 else x.flatten(0, -2)[0] for x in pieces]
     return torch.cat(first), torch.tensor([i for _, places in some for i in places], dtype=torch.int32), own
 

@@ -42,7 +42,7 @@ class Scheme:
         """Those of a state, all worlds one after the other; its memory last, where there are anchors."""
         batch = tuple(state.q.shape[:-1])
         given = self._inward(state, plan)
-        given = {name: whole(x, batch if self.widths[name] is NUMBER else (*batch, x.shape[-1])) for name, x in given.items()}
+        given = {name: whole(x, batch if self.widths[name] == NUMBER else (*batch, x.shape[-1])) for name, x in given.items()}
         if any(plan.anchors):
             given["memory"] = whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
         return given

@@ -77,19 +77,26 @@ template <class V, class N, int D = 3> struct Balance {
       for (int j = plan.v[k]; j < plan.v[k] + freedoms(plan.kind[k]); j++) {
         const V* s = chord_axes + S * j;
         residual[j] += dot<T>(s, pulls[k].torque) + dot<D>(s + T, pulls[k].force);
-        if (pushes[k].any) residual[j] += worked<D>(axes + S * j, pushes[k].moment, pushes[k].force);
       }
+    add_pushed(residual);
   }
 
-  // What contacts and forces from outside do where the nodes are, summed up over all that each joint moves.
-  template <bool CONTACTS = true, bool OUTSIDE = true> void press() {
+  // What contacts and forces from outside do where the nodes are.
+  void press() {
+    gather([&] { touch(), push(); });
+  }
+  // What these put on the nodes, summed up over all that each joint moves.
+  template <class F> void gather(F&& put) {
     for (int k = 0; k < plan.nodes; k++) pushes[k].any = false;
-    if constexpr (CONTACTS) contacts.look(now), contacts.press(pushes);
-    if constexpr (OUTSIDE && D == 3) push_from_outside(plan, now, pushes);
+    put();
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
   }
-  // Adds the residual of it.
+  void touch() { contacts.look(now), contacts.press(pushes); }
+  void push() {
+    if constexpr (D == 3) push_from_outside(plan, now, pushes);
+  }
+  // Adds the residual of what has been gathered.
   void add_pushed(V* out) const {
     for (int k = 0; k < plan.nodes; k++)
       for (int j = plan.v[k]; pushes[k].any && j < plan.v[k] + freedoms(plan.kind[k]); j++)

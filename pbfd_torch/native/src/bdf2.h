@@ -74,7 +74,8 @@ template <class V, class N, int D> struct Bdf2 {
   void resize(M which, V dt, V other, State& x) {
     place(plan, x.q, there, axes);
     each_entry([&](int k, int i) {
-      const V now = entry(there, k, i), last = now - x.history[at(0, k, i)], before = x.history[at(0, k, i)] - x.history[at(1, k, i)];
+      const V now = entry(there, k, i), last = now - x.history[at(0, k, i)];
+      const V before = x.history[at(0, k, i)] - x.history[at(1, k, i)];
       remember(plan, which, k, i, now, rate(last, before) / dt, (last - before) / (dt * dt), other, x);
     });
     for (int i = 0; i < plan.nv; i++) {
@@ -134,8 +135,7 @@ template <class V, class N, int D> struct Bdf2 {
   V push(const Balance<V, N, D>& b, const V* q) {
     V total(0);
     b.contacts.each_normal_force(b.now, [&](int, V force) { total += force; });
-    for (int i = 0; i < plan.nv; i++) turned[i] = slopes[i] = V(0);
-    joint_loads<LIMITS>(plan, b.steps(), q, turned, slopes);
+    forces_of<LIMITS>(b, q, turned, slopes);
     const V reach = V(plan.reach[0]), weight = V(plan.scale[0]) / select(V(plan.turns[0]) > V(0), reach, V(1));
     for (int i = 0; i < plan.nv; i++) total += abs(turned[i]) / select(V(plan.turns[i]) > V(0), reach, V(1));
     return total / weight;

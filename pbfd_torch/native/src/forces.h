@@ -22,8 +22,8 @@ inline void forces_by_share(const Balance<V, N, D>& b, const V* q, V* rough, V* 
 // Abrupt ones, of contacts and limits, and the others. The pushes are found anew.
 template <class V, class N, int D> inline void forces_by_onset(Balance<V, N, D>& b, const V* q, V* abrupt, V* others, V* slopes) {
   forces_of<LIMITS>(b, q, abrupt, slopes), forces_of<SMOOTH | DRY>(b, q, others, slopes);
-  b.template press<true, false>(), b.add_pushed(abrupt);
-  b.template press<false, true>(), b.add_pushed(others);
+  b.gather([&] { b.touch(); }), b.add_pushed(abrupt);
+  b.gather([&] { b.push(); }), b.add_pushed(others);
   for (int i = 0; i < b.plan.nv; i++) abrupt[i] = -abrupt[i], others[i] = -others[i];
 }
 

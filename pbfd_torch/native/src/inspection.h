@@ -6,8 +6,8 @@ namespace pbfd {
 
 // r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. behind: see `Contacts`.
 template <class T, int D>
-inline void inspect(const Plan<T, D>& plan, const T* behind, const T* q, const T* v, const T* control, const T* at, T dt, Arena<T> arena,
-                    T* residual, T* matrix) {
+inline void inspect(const Plan<T, D>& plan, const T* behind, const T* q, const T* v, const T* control, const T* at, T dt,
+                    Arena<T> arena, T* residual, T* matrix) {
   Balance<T, T, D> balance(plan, arena);
   T* room = arena.take(18 * plan.nodes);
   balance.dt = dt, balance.share = T(0.5), balance.contacts.grip = plan.contact.grip, balance.contacts.behind = behind;

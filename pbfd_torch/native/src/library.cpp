@@ -19,7 +19,8 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  return {{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms}, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
+  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
+  return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
 }
 
 template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* given, void* const* found) {
@@ -27,7 +28,9 @@ template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* gi
           static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
 }
 
-Rules rules(const pbfd_plan* p, const pbfd_steps* s) { return {s->dt, s->tolerance, s->surplus, s->share, s->jump, p->halvings, s->evaluations}; }
+Rules rules(const pbfd_plan* p, const pbfd_steps* s) {
+  return {s->dt, s->tolerance, s->surplus, s->share, s->jump, p->halvings, s->evaluations};
+}
 
 template <class N, int D> Plan<N, D> plan_of(const pbfd_plan* p, const N* numbers) {
   return {sizes(p), p->whole, numbers, static_cast<const typename Kind<N>::Scalar*>(p->sample)};
@@ -85,7 +88,8 @@ template <template <class, class, int> class Scheme> struct Starting {
     const void* before[] = {s->given[0], s->trial[0], s->trial[1], s->trial[2]};
     Rules trial = rules(p, s);
     trial.share = 1;
-    starts.run(journey<T>(s, before, s->trial + 3), trial, s->trial, static_cast<const T*>(s->given[1]), s->found, s->first, s->last);
+    const T* speeds = static_cast<const T*>(s->given[1]);
+    starts.run(journey<T>(s, before, s->trial + 3), trial, s->trial, speeds, s->found, s->first, s->last);
   }
 };
 
@@ -207,7 +211,9 @@ void pbfd_implicit_euler_record(const pbfd_plan* p, const pbfd_roster* r, const 
   record_by<ImplicitEuler>(p, r, a, room);
 }
 
-void pbfd_bdf2_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) { record_by<Bdf2>(p, r, a, room); }
+void pbfd_bdf2_record(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
+  record_by<Bdf2>(p, r, a, room);
+}
 
 void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* residual, void* jacobian, void* room) {
   const bool plane = p->dimension == 2;

@@ -2,6 +2,7 @@
 // evaluation for all lanes and each lane's own decision, by masks.
 #pragma once
 #include <cfloat>
+#include "forces.h"
 #include "linear.h"
 #include "search.h"
 
@@ -134,9 +135,8 @@ template <class V, class N, int D = 3> struct Newton {
 
   // Where the forces are not to be balanced (`BalanceObjective.absurd`): what drives the bodies would move them beyond all reason.
   M absurd() {
-    V *driven = column, *slopes = step;  // these are not asked for
-    for (int i = 0; i < plan.nv; i++) driven[i] = slopes[i] = V(0);
-    joint_loads<SMOOTH | DRY>(plan, balance.steps(), trial, driven, slopes);
+    V* driven = column;
+    forces_of<SMOOTH | DRY>(balance, trial, driven, step);
     M found(false);
     for (int i = 0; i < plan.nv; i++)
       found = found | (abs(driven[i]) > V(ABSURD) * balance.weight * fma(far, V(plan.heft[i]), V(plan.armature[i])));

@@ -35,7 +35,8 @@ template <class V, class N, int D, class Scheme> struct Starts {
 
   // Worlds first … last − 1, with these speeds [worlds, nv]. trial: their step; `others` is what it is given but q, and is filled
   // here.
-  void run(const Journey<T>& trial, const Rules& rules, void* const* others, const T* speeds, void* const* found, int first, int last) {
+  void run(const Journey<T>& trial, const Rules& rules, void* const* others, const T* speeds, void* const* found, int first,
+           int last) {
     const T* q = static_cast<const T*>(trial.given[0]);
     T* back = static_cast<T*>(others[0]);
     const V dt = V(T(rules.dt));

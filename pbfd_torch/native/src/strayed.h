@@ -1,6 +1,7 @@
 // What a step that ended somewhere looks like there: whether anything pushes, and whether its root can be trusted, as
 // balance/objective.py.
 #pragma once
+#include "forces.h"
 #include "integrators.h"
 
 namespace pbfd {
@@ -26,8 +27,7 @@ template <class V, class N, int D> struct Sight {
     look(q);
     M found(false);
     b.contacts.each_normal_force(there, [&](int, V force) { found = found | (force > V(0)); });
-    for (int i = 0; i < plan.nv; i++) turned[i] = slopes[i] = V(0);  // these are not asked for
-    joint_loads<LIMITS>(plan, b.steps(), q, turned, slopes);
+    forces_of<LIMITS>(b, q, turned, slopes);
     for (int i = 0; i < plan.nv; i++) found = found | (abs(turned[i]) > V(0));
     return found;
   }
