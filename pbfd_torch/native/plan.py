@@ -13,8 +13,6 @@ from torch import Tensor
 from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
@@ -190,8 +188,6 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     a = stepper.articulation
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
-    if type(stepper.integrator) not in (EnergyMomentum, ImplicitEuler, Variational, Bdf2):
-        raise unknown(f"integrator {type(stepper.integrator).__name__}")
     if stepper.step_size.ndim:
         raise unknown("a step of its own for each world")
     if not isinstance(stepper.evaluations, int):

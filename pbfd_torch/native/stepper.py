@@ -19,7 +19,7 @@ from pbfd_torch.integrators.integrator import Integrator, S, fresh
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.core import Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
-from pbfd_torch.native.not_compiled import NotCompiledError
+from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.native.recording import Record, Writer
 from pbfd_torch.native.schemes import SCHEMES, Scheme
@@ -174,6 +174,8 @@ def plan_of(eager: EagerStepper[Any]) -> Plan:
         raise NotCompiledError(reason())
     if eager.solver != Fallbacks():
         raise NotCompiledError("the core does not know a solver other than the default one")
+    if type(eager.integrator) not in SCHEMES:
+        raise unknown(f"integrator {type(eager.integrator).__name__}")
     return planned(eager)
 
 
