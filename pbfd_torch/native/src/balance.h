@@ -186,8 +186,10 @@ template <class V, class N, int D = 3> struct Balance {
 
   void pull_all() {
     for (int k = 0; k < plan.nodes; k++) {
-      pulls[k].any = heavy(k);  // a joint may only lead to others
-      if (heavy(k)) pull(plan, k, inert, share, holds[k], now, pulls[k]);
+      pulls[k] = {};  // a joint may only lead to others, or to nothing
+      if (!heavy(k)) continue;
+      pulls[k].any = true;
+      pull(plan, k, inert, share, holds[k], now, pulls[k]);
     }
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0) pulls[plan.parent[k]].add(pulls[k]);

@@ -137,6 +137,10 @@ template <class V, class N, int D = 3> struct Newton {
   M absurd() {
     V* driven = column;
     forces_of<SMOOTH | DRY>(balance, trial, driven, step);
+    if (plan.pushes > 0) {
+      balance.gather([&] { balance.push(); }), balance.add_pushed(driven);
+      balance.press();
+    }
     M found(false);
     for (int i = 0; i < plan.nv; i++)
       found = found | (abs(driven[i]) > V(ABSURD) * balance.weight * fma(far, V(plan.heft[i]), V(plan.armature[i])));
