@@ -28,6 +28,8 @@ class _Plan(ctypes.Structure):
             )
         ),
         *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),
+        *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots")),
+        *((name, ctypes.c_void_p) for name in ("body_whole", "body_real")),
     )
 
 
@@ -47,7 +49,10 @@ class Calls:
         self._kept, self._threads = plan, threads  # the library reads the plan's numbers where they are
         self._functions = library.functions
         tables = (x.data_ptr() for x in (plan.whole, plan.real, plan.sample, plan.which))
-        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, len(plan.which), *tables)
+        bodies = plan.bodies
+        self._bodies = torch.tensor(bodies.whole, dtype=torch.int32), bodies.real.to(plan.real.dtype)
+        self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, len(plan.which), *tables, *bodies.size)
+        self._plan.body_whole, self._plan.body_real = (x.data_ptr() for x in self._bodies)
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), len(plan.real)):
             raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")

@@ -16,6 +16,7 @@ from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
+from pbfd_torch.native.plan_bodies import Bodies
 from pbfd_torch.native.plan_contact import Candidates, joined, on_nodes
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
@@ -23,6 +24,7 @@ from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import SHORTEST_STEP
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
+from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
@@ -33,7 +35,7 @@ from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
-CONTACTS = (Contact, CurvedContact)
+CONTACTS = (Contact, CurvedContact, BodyContact)
 TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Pushes, *CONTACTS)
 
 
@@ -41,9 +43,9 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
-    dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their μ: the core knows these in space only,
-    and not with BDF2. order: where the candidates are among those of all contact terms. anchors: how many each contact has, in the
-    order of a state's memory. seats: where links are on the nodes."""
+    bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
+    μ: the core knows these in space only, and not with BDF2. order: where the candidates are among those of all contact terms.
+    anchors: how many each contact has, in the order of a state's memory. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -51,6 +53,7 @@ class Plan:
     which: Tensor
     own: Tensor
     sample: Tensor
+    bodies: Bodies
     dimension: int
     apart: bool
     order: tuple[int, ...]
@@ -69,7 +72,7 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     parts, bdf2 = _parts(stepper), isinstance(stepper.integrator, Bdf2)
     if parts.apart and bdf2:
         raise unknown("BDF2 of worlds that differ")
-    if parts.apart or bdf2 or parts.pushed or not parts.candidates.flat:  # of which the core knows space only
+    if parts.apart or bdf2 or parts.pushed or parts.bodies.rows or not parts.candidates.flat:  # of which the core knows space only
         return parts.plan()
     plane = plane_of(parts.a, [parts.gravity, *parts.candidates.normals])
     return (parts if plane is None else parts.within(plane)).plan()
@@ -94,6 +97,7 @@ class _Parts:
     nodes: Sequence[Tensor]
     gravity: Tensor
     candidates: Candidates
+    bodies: Bodies
     driven: list[int]
     pushed: list[int]
     halvings: int
@@ -106,7 +110,7 @@ class _Parts:
     def real(self) -> list[Tensor]:
         """All numbers."""
         nodes = (x.flatten(-rank) for x, rank in zip(self.nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True))
-        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes]
+        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes, *self.bodies.laws]
 
     @property
     def apart(self) -> bool:
@@ -134,6 +138,7 @@ class _Parts:
             which=which,
             own=own,
             sample=torch.cat([a.rest.new_empty(0), *candidates.samples]),
+            bodies=self.bodies,
             dimension=self.dimension,
             apart=self.apart,
             order=candidates.order,
@@ -159,6 +164,7 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
+        bodies=Bodies.of(a, known.meetings),
         driven=driven,
         pushed=known.pushed,
         halvings=len(shares) - 1,
@@ -260,6 +266,7 @@ class _Terms:
         self.pushed: list[int] = []  # nodes
         self.pushes: list[tuple[Tensor, Tensor]] = []  # points and forces
         self.candidates = Candidates()
+        self.meetings: list[BodyContact] = []
         seen: set[type] = set()
         for term in stepper.terms:
             inner: Any = term
@@ -292,6 +299,9 @@ class _Terms:
                 self.actuators = term
             case Contact():
                 self.candidates.take(a, term)
+            case BodyContact():
+                self.meetings.append(term)
+                self.candidates.taken += term.finder.slots
             case Pushes():
                 self._push(a, term)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.contact_laws import ContactLaws
 from pbfd_torch.terms.coulomb_friction import CoulombFriction, DryFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.friction_law import FrictionLaw
@@ -118,29 +120,11 @@ class Candidates:
     def take(self, a: Articulation, term: Contact) -> None:
         """Adds the candidates of a contact. Raises `NotCompiledError`."""
         name = term.pairs[0][1] if term.pairs else "the ground"
-        law, friction = term.normal_force, term.friction
-        if type(law) is not NormalForce or law.exponent != 2.0:
-            raise unknown(f"normal force on '{name}' with another exponent than 2")
-        width, anchored = _width(friction), isinstance(friction, AnchoredFriction)
-        if term.restitution is not None:
-            raise unknown("restitution")
+        anchored = isinstance(term.friction, AnchoredFriction)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
         moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0], dtype=torch.long)  # others ride on the world
 
-        def each(value: float | Tensor | None, other: float) -> Tensor:
-            number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
-            return number.expand(*number.shape[:-1], len(nodes))
-
-        mu = friction.mu if isinstance(friction, DryFriction) else 0.0
-        numbers = (
-            term.radius,
-            term.margin,
-            each(law.stiffness, 0.0) * each(term.firm, 1.0),
-            each(mu if term.grip is None else mu * term.grip, 0.0),
-            each(term.deep, torch.finfo(a.dtype).max),
-            1.0 / each(law.release, 0.0),
-            1.0 / each(width, 1.0),
-        )
+        numbers = (term.radius, term.margin, *laws_of(a, term, f"'{name}'", len(nodes)))
         anchor = sum(self.anchors)
         self.anchors.append(len(nodes) if anchored else 0)
         before = self.taken
@@ -183,10 +167,10 @@ class Candidates:
                 start, end = _one(surface.start, 1, name), _one(surface.end, 1, name)
                 half = 0.5 * torch.linalg.vector_norm(end - start, dim=-1, keepdim=True)
                 sizes = [_one(surface.radius, 0, name), half]
-                along = _along(start, end)
-                if any(self.anchors[-1:]) and not bool((along[..., :3, :3] == torch.eye(3, dtype=a.dtype)).all()):
+                placed = along(start, end)
+                if any(self.anchors[-1:]) and not bool((placed[..., :3, :3] == torch.eye(3, dtype=a.dtype)).all()):
                     raise unknown(f"anchors on '{name}', a capsule that does not lie along z")
-                frame = frame @ along
+                frame = frame @ placed
             case BoxSurface():
                 sizes = [_one(surface.half_extents, 1, name)]
             case CylinderSurface():
@@ -213,6 +197,31 @@ class Candidates:
         turn = link_frames(a, term.link)[..., :3, :3]
         axis = (turn @ term.axis[..., None]).squeeze(-1)
         self.forms.append(((turn @ term.form @ turn.mT).flatten(-3), axis.flatten(-2), term.lying.to(term.form.dtype)))
+
+
+def laws_of(a: Articulation, term: ContactLaws[Any], name: str, count: int) -> Sequence[Tensor]:
+    """C⊥, μ, from which depth on it is a hazard [m], one over the release speed [s/m] and one over what friction is smooth below,
+    a slip speed [s/m] or the stretch of an anchor [1/m], of so many candidates or pairs, `[*, n]` each. Raises `NotCompiledError`
+    for other laws."""
+    law, friction = term.normal_force, term.friction
+    if type(law) is not NormalForce or law.exponent != 2.0:
+        raise unknown(f"normal force on {name} with another exponent than 2")
+    width = _width(friction)
+    if term.restitution is not None:
+        raise unknown("restitution")
+
+    def each(value: float | Tensor | None, other: float) -> Tensor:
+        number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
+        return number.expand(*number.shape[:-1], count)
+
+    mu, grip = friction.mu if isinstance(friction, DryFriction) else 0.0, getattr(term, "grip", None)
+    return (
+        each(law.stiffness, 0.0) * each(term.firm, 1.0),
+        each(mu if grip is None else mu * grip, 0.0),
+        each(term.deep, torch.finfo(a.dtype).max),
+        1.0 / each(law.release, 0.0),
+        1.0 / each(width, 1.0),
+    )
 
 
 def _differing(name: str) -> NotCompiledError:
@@ -245,11 +254,11 @@ def joined(*pieces: Tensor, dim: int = -1) -> Tensor:
     return torch.cat([x.expand(*batch, *x.shape[dim:]) for x in pieces], dim)
 
 
-def _along(start: Tensor, end: Tensor) -> Tensor:
+def along(start: Tensor, end: Tensor) -> Tensor:
     """The frame `[*, 4, 4]` in the middle of a segment whose z axis lies along it."""
-    eye, along = torch.eye(3, dtype=start.dtype), end - start
-    along = torch.where((along != 0).any(-1, keepdim=True), along, eye[2])
-    z = along / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+    eye, way = torch.eye(3, dtype=start.dtype), end - start
+    way = torch.where((way != 0).any(-1, keepdim=True), way, eye[2])
+    z = way / torch.linalg.vector_norm(way, dim=-1, keepdim=True)
     y = torch.linalg.cross(z, eye[z.abs().argmin(-1)])
     y = y / torch.linalg.vector_norm(y, dim=-1, keepdim=True)
     return homogeneous(torch.stack((torch.linalg.cross(y, z), y, z), -1), 0.5 * (start + end))

@@ -29,7 +29,7 @@ _SOLUTION = ("status", "iterations", "evaluations", "residual_norm", "fallbacks"
 class _Roster(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int) for name in ("links", "slots", "first_limit", "own")),
-        *((name, ctypes.c_void_p) for name in ("carrier", "slot", "danger", "real")),
+        *((name, ctypes.c_void_p) for name in ("carrier", "slot", "danger", "real", "meeting_slot", "meeting_danger")),
     )
 
 
@@ -68,7 +68,9 @@ class Writer(Generic[S]):
         asked.own = own.data_ptr()
         real = r.real if r.real.ndim == 1 else whole(r.real, (*batch, r.real.shape[-1]))
         listed = _Roster(len(r.carrier), r.slots, r.first_limit, real.ndim > 1)
-        for name, table in {"carrier": r.carrier, "slot": r.slot, "danger": r.danger, "real": real}.items():
+        tables = {"carrier": r.carrier, "slot": r.slot, "danger": r.danger, "real": real}
+        tables |= {"meeting_slot": r.meeting_slot, "meeting_danger": r.meeting_danger}
+        for name, table in tables.items():
             setattr(listed, name, table.data_ptr())
         self._calls.share(f"{self._scheme.function}_record", asked, steps, steps // WORTH_A_BLOCK, listed)
 

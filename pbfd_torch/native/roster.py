@@ -13,6 +13,7 @@ from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.native.plan_contact import joined
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.load import Hazardous, StepContext
@@ -30,6 +31,8 @@ class Roster:
     slot: Tensor
     danger: Tensor
     first_limit: int
+    meeting_slot: Tensor
+    meeting_danger: Tensor
     real: Tensor
     still: tuple[Tensor, dict[str, Tensor]]
 
@@ -39,34 +42,49 @@ def rostered(stepper: EagerStepper[Any], plan: Plan) -> Roster:
     """Of a stepper's scene, with its plan."""
     a = aligned(stepper.articulation)
     carrier = torch.tensor(a.topology.link_node, dtype=torch.int32) - 1
-    dangers, first_limit = _dangers(stepper)
+    dangers, order = _dangers(stepper), list(plan.order)
     moment = (a.link_frame @ a.pseudo_inertia)[..., carrier < 0, :3, 3].sum(-2)
-    still = _Still(stepper, dangers)
+    still = _Still(stepper, dangers.of_slots)
     energy = still.energy - (stepper.scene.gravity * moment).sum(-1)
     numbers = (a.mass.sum(-1), moment, energy, still.strain, still.suspect.to(a.dtype))
     return Roster(
-        slots=len(dangers),
+        slots=len(dangers.of_slots),
         carrier=carrier,
-        slot=torch.tensor(plan.order, dtype=torch.int32),
-        danger=torch.tensor([dangers[i] for i in plan.order], dtype=torch.int32),
-        first_limit=first_limit,
+        slot=torch.tensor(order, dtype=torch.int32),
+        danger=torch.tensor([dangers.of_slots[i] for i in order], dtype=torch.int32),
+        first_limit=dangers.first_limit,
+        meeting_slot=torch.tensor([slot for slot, _ in dangers.meetings], dtype=torch.int32),
+        meeting_danger=torch.tensor([danger for _, danger in dangers.meetings], dtype=torch.int32),
         real=joined(a.link_frame[..., :3, :].flatten(-3), *(x if x is moment else x[..., None] for x in numbers)).contiguous(),
         still=(torch.tensor(still.slots, dtype=torch.long), still.seen),
     )
 
 
-def _dangers(stepper: EagerStepper[Any]) -> tuple[list[int], int]:
-    """The number among the dangers of what is in each slot, and that of the first limit; −1: there are no limits."""
+@dataclass(frozen=True)
+class _Dangers:
+    """The number among the dangers of what is in each slot of candidates (of contact between bodies: of the first pair), and that
+    of the first limit; −1: there are no limits. meetings: of each term of contact between bodies its first slot and danger."""
+
+    of_slots: list[int]
+    first_limit: int
+    meetings: list[tuple[int, int]]
+
+
+def _dangers(stepper: EagerStepper[Any]) -> _Dangers:
     slots: list[int] = []
+    meetings: list[tuple[int, int]] = []
     count, first_limit = 0, -1
     for term in stepper.terms:
         if isinstance(term, Contact):
             slots += range(count, count + len(term.link))
+        elif isinstance(term, BodyContact):
+            meetings.append((len(slots), count))
+            slots += [count] * term.finder.slots
         elif isinstance(term, JointLimits):
             first_limit = count
         if isinstance(term, Hazardous):
             count += len(term.dangers(stepper.articulation))
-    return slots, first_limit
+    return _Dangers(slots, first_limit, meetings)
 
 
 class _Still:
@@ -82,6 +100,8 @@ class _Still:
         shares = [a.rest.new_tensor([-math.inf])]  # of none
         first = 0
         for term in stepper.terms:
+            if isinstance(term, BodyContact):
+                first += term.finder.slots
             if not isinstance(term, Contact):
                 continue
             here = [i for i, link in enumerate(term.link.tolist()) if a.topology.link_node[link] == 0]

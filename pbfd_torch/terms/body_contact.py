@@ -25,7 +25,7 @@ from pbfd_torch.errors import ContactOverflowError
 from pbfd_torch.tensors.vectors import applied, extended, in_frames, mapped, outer
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive
-from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
+from pbfd_torch.terms.contact_laws import ContactLaws, ContactPoints, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.touching import ContactForce, Touching
@@ -211,6 +211,12 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
             bend=None if field.flat else lambda: field.bend,
             steepness=field.steepness,
         )
+
+    def points(self, prepared: PreparedBodyContact, placement: Placement) -> ContactPoints:
+        """See `ContactLaws`. Empty slots hold zeros, far from everything."""
+        found, filled = super().points(prepared, placement), prepared.slots.filled[..., None]
+        vectors = ("point", "normal", "force", "slip")
+        return replaced(found, **{name: torch.where(filled, getattr(found, name), 0.0) for name in vectors})
 
     def load(self, prepared: PreparedBodyContact, placement: Placement) -> LinkLoad:
         slots, contact = prepared.slots, self.force(prepared, placement)

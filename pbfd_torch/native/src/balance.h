@@ -9,6 +9,7 @@
 #include "contact.h"
 #include "inertia.h"
 #include "joints.h"
+#include "meetings.h"
 #include "pushes.h"
 
 namespace pbfd {
@@ -30,39 +31,48 @@ template <class V, class N, int D = 3> struct Balance {
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
   Contacts<V, N, D> contacts;
+  Meetings<V, N, D> meetings;
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 4 + s.nv) * s.nv +
-           s.candidates;
+           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
+           (3 * S + 4 + s.nv) * s.nv + held(s);
   }
+  static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
   template <class X> static X* taken(Arena<V>& arena, int count) {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
   }
 
-  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, relaxed, arena) {
+  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, relaxed, arena), meetings(scene, relaxed, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    fitted = arena.take(plan.nv), relaxed.held = arena.take(plan.candidates);
+    fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan));
     relaxed.none();
     limits = arena.take(plan.nv), arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
     holds = taken<Hold<V, D>>(arena, plan.nodes), pulls = taken<Pull<V, D>>(arena, plan.nodes);
     pushes = taken<Push<V, D>>(arena, plan.nodes);
+    part();
+  }
+  void part() {
     for (int i = 0; i < plan.nv * plan.nv; i++) matrix[i] = V(0);  // dofs on different branches stay uncoupled
   }
+  Branches branches() const { return meetings.branches(); }
 
-  // The start and its axes, the target, κ, w and what is relaxed are known.
-  void begin() {
+  // The start and its axes, the target, κ, w and what is relaxed are known. `anew`: which lanes begin a step here that they did not
+  // begin before; `sorted`: see `Meetings`.
+  void begin(typename Kind<V>::Mask anew = true, bool sorted = false) {
     inert = weight / (relaxed.length * relaxed.length);
     for (int k = 0; k < plan.nodes; k++)
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
     contacts.begin(start, target, dt);
+    meetings.begin(anew, start, target, dt, sorted);
+    if (meetings.slots.changed) part(), meetings.slots.changed = false;
   }
 
   // r at q; J by `assemble`.
@@ -92,7 +102,10 @@ template <class V, class N, int D = 3> struct Balance {
     for (int k = plan.nodes - 1; k > 0; k--)
       if (plan.parent[k] >= 0 && pushes[k].any) pushes[plan.parent[k]].add(pushes[k]);
   }
-  void touch() { contacts.look(now), contacts.press(pushes); }
+  void touch() {
+    contacts.look(now), contacts.press(pushes);
+    meetings.look(now), meetings.press(pushes);
+  }
   void push() {
     if constexpr (D == 3) push_from_outside(plan, now, pushes);
   }
@@ -106,6 +119,7 @@ template <class V, class N, int D = 3> struct Balance {
   // J, or with `curved` false the stiffness: J without how the axes turn under the forces. After it J needs another `evaluate`.
   void assemble(const V* q, bool curved) {
     if (!curved) let_go(now), pull_all();
+    if (meetings.any_row()) uncouple();
     for (int k = 0; k < plan.nodes; k++) {
       const Pull<V, D>& pull = pulls[k];
       const Push<V, D>& push = pushes[k];
@@ -162,12 +176,27 @@ template <class V, class N, int D = 3> struct Balance {
           turning_loads(plan, k, steps(), q, static_cast<V*>(nullptr), matrix);
         }
     }
+    meetings.couple(axes, matrix);
     if (!curved) let_go(target);
+  }
+
+  // See `Contacts`.
+  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
+    contacts.each_normal_force(at, visit), meetings.each_normal_force(at, visit);
   }
 
   JointStep<V> steps() const { return {q_start, q_target, control, limits, fitted, dt, inert, relaxed}; }
 
  private:
+  // What bodies that touch each other fill in.
+  void uncouple() {
+    const Branches all = branches();
+    for (int j = 0; j < plan.nv; j++)
+      for (int a = 0; a < all.depth[j]; a++) {
+        const int i = all.above[plan.nv * j + a];
+        matrix[plan.nv * i + j] = matrix[plan.nv * j + i] = V(0);
+      }
+  }
   bool heavy(int k) const { return any(plan.mass[k] > N(0)); }
   static V along(const V* a, const V* b) { return dot<S>(a, b); }
 

@@ -95,23 +95,23 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     for (int i = 0; i < n; i++) after.average[i] = per * after.average[i];
 
     // what V_n and V_{n+1} = 2 ΔT/Δt − V_n are on the joints' motions; at the end of the step, ΔT/Δt and half its fall
-    const V factor = select(on_chord, V(2), V(1)), less = select(on_chord, V(-1), zero), fall = select(on_chord, zero, half * h);
+    const V twice = select(on_chord, V(2), V(1)), less = select(on_chord, V(-1), zero), fall = select(on_chord, zero, half * h);
     V* rates = momenta.rates;
     pose_rates(plan, b.start, b.start_axes, before.v, momenta.twist, rates);
     for (int k = 0; k < plan.nodes; k++) {
       const V* rate = rates + (D * D + D) * k;
       V next[D * D + D];
       for (int i = 0; i < D * D; i++)
-        next[i] = fma(factor * per, b.now.rotation[D * D * k + i] - b.start.rotation[D * D * k + i], less * rate[i]);
+        next[i] = fma(twice * per, b.now.rotation[D * D * k + i] - b.start.rotation[D * D * k + i], less * rate[i]);
       for (int i = 0; i < D; i++) {
         const V kept = fma(less, rate[D * D + i], fall * V(plan.gravity[i]));
-        next[D * D + i] = fma(factor * per, b.now.position[D * k + i] - b.start.position[D * k + i], kept);
+        next[D * D + i] = fma(twice * per, b.now.position[D * k + i] - b.start.position[D * k + i], kept);
       }
       momenta.take(k, b.now, next);
     }
     for (int i = 0; i < n; i++) {
       impulse[i] = h * rough[i];
-      momentum[i] = V(plan.armature[i]) * fma(factor, after.average[i], less * before.v[i]);
+      momentum[i] = V(plan.armature[i]) * fma(twice, after.average[i], less * before.v[i]);
     }
     momenta.add_to(momentum, b.axes);
     for (int i = 0; i < n; i++) {
@@ -127,8 +127,8 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
       other[i] = momentum[i] - row - h * smooth[i];
       after.v[i] = momentum[i], after.push[i] = impulse[i];
     }
-    factor_along_the_tree(plan, matrix);
-    substitute_along_the_tree(plan, matrix, after.v), substitute_along_the_tree(plan, matrix, after.push);
+    factor(tree(plan), matrix);
+    substitute(tree(plan), matrix, after.v), substitute(tree(plan), matrix, after.push);
     V kept(0), whole(0);
     for (int i = 0; i < n; i++) kept = fma(impulse[i], before.push[i], kept), whole = fma(impulse[i], after.push[i], whole);
     const V share = clamped(kept / select(whole > zero, whole, V(1)), zero, V(1));
@@ -136,7 +136,7 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
       after.lag[i] = -early(b, i) * (other[i] - (V(1) - share) * impulse[i]);
       after.steady[i] = share * after.push[i];
     }
-    substitute_along_the_tree(plan, matrix, after.lag);
+    substitute(tree(plan), matrix, after.lag);
 
     for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
     const V first = momenta.kinetic(b.start, b.start_axes, total);

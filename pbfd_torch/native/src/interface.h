@@ -20,6 +20,10 @@ struct pbfd_plan {
   const void* real;
   const void* sample;  // of terrain and meshes
   const int* which;    // [varied] of `real`, in order
+  // contact between bodies, in space only, as bodies.h reads it
+  int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0;
+  const int* body_whole = nullptr;
+  const void* body_real = nullptr;
 };
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
@@ -71,6 +75,7 @@ struct pbfd_roster {
   int links, slots, first_limit, own;
   const int *carrier, *slot, *danger;
   const void* real;
+  const int *meeting_slot, *meeting_danger;  // the first ones of each group of pairs of bodies
 };
 
 // The record of steps `first` … `last` − 1 of all steps of all worlds that have been made, where world w makes its steps w,
@@ -98,3 +103,9 @@ PBFD_FUNCTION void pbfd_bdf2_record(const pbfd_plan*, const pbfd_roster*, const 
 // The balance of forces that energy–momentum steps from the given states solve, at configurations [worlds, nq]: r [worlds, nv] and
 // J [worlds, nv · nv].
 PBFD_FUNCTION void pbfd_balance(const pbfd_plan*, const pbfd_steps*, const void* q, void* residual, void* jacobian, void* room);
+
+// Contact points of pairs of convex shapes, see hulls.h and finding.h: pairs [count, 3] a, b, whether both are boxes; poses
+// [count, 2, 12]; moves [count]. counts [count, 2] count, swapped; found [count, 4 + 8 · 4] normal, offset, and each point with its
+// gap; apart [count, 5] direction, separation along it, and distance.
+PBFD_FUNCTION void pbfd_meet(int bytes, const int* whole, const void* real, int count, const int* pairs, const void* poses,
+                             const void* moves, int* counts, void* found, void* apart);

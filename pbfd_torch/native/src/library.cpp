@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "finding.h"
 #include "inspection.h"
 #include "record.h"
 #include "starts.h"
@@ -10,7 +11,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 7; }
+int pbfd_interface() { return 8; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -20,7 +21,8 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) {
   const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
-  return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes};
+  return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
+          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots}};
 }
 
 template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* given, void* const* found) {
@@ -33,7 +35,8 @@ Rules rules(const pbfd_plan* p, const pbfd_steps* s) {
 }
 
 template <class N, int D> Plan<N, D> plan_of(const pbfd_plan* p, const N* numbers) {
-  return {sizes(p), p->whole, numbers, static_cast<const typename Kind<N>::Scalar*>(p->sample)};
+  using T = typename Kind<N>::Scalar;
+  return {sizes(p), p->whole, numbers, static_cast<const T*>(p->sample), p->body_whole, static_cast<const T*>(p->body_real)};
 }
 
 template <class V> Numbers<V> numbers_of(const pbfd_plan* p, const void* own, int first, int count, Arena<V>& arena) {
@@ -134,7 +137,7 @@ template <template <class, class, int> class Scheme> struct Recording {
     using T = typename Kind<V>::Scalar;
     auto out = [](void* array) { return static_cast<T*>(array); };
     const Roster<T> roster{r->links, r->slots, r->first_limit, r->own != 0,
-                           r->carrier, r->slot, r->danger, static_cast<const T*>(r->real)};
+                           r->carrier, r->slot, r->danger, r->meeting_slot, r->meeting_danger, static_cast<const T*>(r->real)};
     const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, out(a->q), out(a->v), out(a->link_poses),
                            out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
                            out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
@@ -221,4 +224,9 @@ void pbfd_balance(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* 
     (plane ? balance_of<double, 2> : balance_of<double, 3>)(p, s, q, residual, jacobian, room);
   else
     (plane ? balance_of<float, 2> : balance_of<float, 3>)(p, s, q, residual, jacobian, room);
+}
+
+void pbfd_meet(int bytes, const int* whole, const void* real, int count, const int* pairs, const void* poses, const void* moves,
+               int* counts, void* found, void* apart) {
+  (bytes == 8 ? find_pairs<double> : find_pairs<float>)(whole, real, count, pairs, poses, moves, counts, found, apart);
 }

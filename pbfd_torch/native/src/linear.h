@@ -1,16 +1,16 @@
-// J x = b where J couples dofs on one branch of the tree only: eliminated from the leaves on, nothing fills in. Without pivots:
-// what is eliminated first is what stands for the lightest bodies.
+// J x = b where J couples the dofs of `Branches` only, eliminated from the leaves on: along the tree alone nothing fills in. Without
+// pivots: what is eliminated first is what stands for the lightest bodies.
 #pragma once
-#include "plan.h"
+#include "branches.h"
 
 namespace pbfd {
 
 // Factors `matrix` [nv × nv] in place, the pivots' inverses on its diagonal; the sign of its determinant.
-template <class V, class N, int D> inline V factor_along_the_tree(const Plan<N, D>& plan, V* matrix) {
-  const int n = plan.nv;
+template <class V> inline V factor(const Branches& along, V* matrix) {
+  const int n = along.count;
   V sign(1);
   for (int j = n - 1; j >= 0; j--) {
-    const int *above = plan.above + n * j, depth = plan.depth[j];
+    const int *above = along.above + n * j, depth = along.depth[j];
     V* row = matrix + n * j;
     const V pivot = row[j], inverse = V(1) / pivot;
     sign = select(pivot < V(0), -sign, select(pivot > V(0), sign, V(0)));
@@ -26,16 +26,16 @@ template <class V, class N, int D> inline V factor_along_the_tree(const Plan<N, 
 }
 
 // x ← matrix⁻¹ x by the factors.
-template <class V, class N, int D> inline void substitute_along_the_tree(const Plan<N, D>& plan, const V* matrix, V* x) {
-  const int n = plan.nv;
+template <class V> inline void substitute(const Branches& along, const V* matrix, V* x) {
+  const int n = along.count;
   for (int j = n - 1; j >= 0; j--) {
-    const int* above = plan.above + n * j;
-    for (int a = 0; a < plan.depth[j]; a++) x[above[a]] = fma(-matrix[n * above[a] + j], x[j], x[above[a]]);
+    const int* above = along.above + n * j;
+    for (int a = 0; a < along.depth[j]; a++) x[above[a]] = fma(-matrix[n * above[a] + j], x[j], x[above[a]]);
   }
   for (int j = 0; j < n; j++) {
-    const int* above = plan.above + n * j;
+    const int* above = along.above + n * j;
     V sum = x[j];
-    for (int a = 0; a < plan.depth[j]; a++) sum = fma(-matrix[n * j + above[a]], x[above[a]], sum);
+    for (int a = 0; a < along.depth[j]; a++) sum = fma(-matrix[n * j + above[a]], x[above[a]], sum);
     x[j] = sum * matrix[n * j + j];
   }
 }

@@ -9,8 +9,6 @@
 
 namespace pbfd {
 
-constexpr int TOO_DEEP = 8, TURNED_FAR = 16;
-
 // What one call is asked for: arrays as interface.h has them.
 template <class T> struct Journey {
   int worlds, steps;
@@ -52,7 +50,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = eased = M(false);
+    newton.running = eased = anew = M(false);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     while (any_aboard()) {
@@ -74,6 +72,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   Fallbacks<T> ways[W];
   bool plainly[W];  // it is posed the step itself
   M eased;          // it is posed an easier step
+  M anew;           // it is posed another step than before
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
@@ -97,7 +96,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     return more;
   }
   void depart(int i) { steer(i), trips[i].begin(rules, scheme.easier), attempt(i); }
-  void attempt(int i) { ways[i].begin(), pose(i); }
+  void attempt(int i) { put(anew, i, true), ways[i].begin(), pose(i); }
 
   // What a lane is to solve next. Most have just made a step, and are to make one.
   void pose(int i) {
@@ -143,7 +142,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const M fits = near(before.q, plan.nq) & slow(plan, velocity, b.dt) & finite(b.control, plan.nu);
     scheme.begin(b, before, guess, eased);
     if (any(b.relaxed.length < V(1))) shorten();
-    b.begin();
+    b.begin(anew), anew = M(false);
     for (int i = 0; i < plan.nq; i++) {
       const V start = select(from_guess, guess[i], select(from_start, before.q[i], newton.q[i]));
       from[i] = select(fits, start, infinite<V>() - infinite<V>());  // from NaN nothing is near, and the search ends at its start
@@ -170,7 +169,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void hold(M which) {
     Balance<V, N, D>& b = newton.balance;
     sight.look(from);
-    b.contacts.each_normal_force(sight.there, [&](int i, V force) { b.relaxed.held[i] = select(which, force, b.relaxed.held[i]); });
+    b.each_normal_force(sight.there, [&](int i, V force) { b.relaxed.held[i] = select(which, force, b.relaxed.held[i]); });
   }
 
   // Lanes whose solve has ended take the next detour, or their attempt has ended; who sets out now.
@@ -217,8 +216,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const M refused = scheme.advance(b, newton.q, before, after, eased);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
     if (plan.anchors > 0) b.contacts.remember(after.behind);
-    M deep, far, kept(false), solved(false), failed(false), part(false), lost(false);
-    look_for_hazards(deep, far);
+    M kept(false), solved(false), failed(false), part(false), lost(false);
+    const Hazards<V> seen = look_for_hazards();
     for (int i = 0; i < W; i++) {
       if (!lane(over, i)) continue;
       const bool good = ways[i].status <= HALVED && !lane(refused, i);
@@ -237,7 +236,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       const bool worth = trip.whole() && (trip.first() || ways[i].error < infinite<T>());
       int how = lane(lost, i) ? int(NON_FINITE) : ways[i].status;
       if (how <= HALVED && lane(refused, i)) how = STALLED;
-      const Then then = trip.after(rules, how, ways[i].error, TOO_DEEP * lane(deep, i) + TURNED_FAR * lane(far, i));
+      const Then then = trip.after(rules, how, ways[i].error, seen.bits(i));
       const bool end = then <= END_OF_PARTS;
       put(ends, i, end), put(fresh, i, !end), put(kept, i, worth && then != END);
       put(from_best, i, then == END_AT_BEST), put(from_parts, i, then == END_OF_PARTS);
@@ -277,11 +276,13 @@ template <class V, class N, int D, class Scheme> struct Machine {
     return !(near(after.q, plan.nq) & finite(velocity, plan.nv));
   }
 
-  // Of contacts and limits (contact/hazards.py).
-  void look_for_hazards(M& deep, M& far) const {
-    deep = far = M(false);
-    newton.balance.contacts.look_for_hazards(deep, far);
-    each_limit(plan, newton.q, [&](int i, V past) { deep = deep | ((past > V(TOO_FAR)) & (V(plan.limit[i]) > V(0))); });
+  Hazards<V> look_for_hazards() const {
+    const Balance<V, N, D>& b = newton.balance;
+    Hazards<V> found;
+    b.contacts.look_for_hazards(found.deep, found.turned);
+    b.meetings.look_for_hazards(found);
+    each_limit(plan, newton.q, [&](int i, V past) { found.deep = found.deep | ((past > V(TOO_FAR)) & (V(plan.limit[i]) > V(0))); });
+    return found;
   }
 
   // Between a lane and the arrays.

@@ -184,8 +184,8 @@ template <class V, class N, int D = 3> struct Newton {
     V *newton = column, *saved = step;
     for (int i = 0; i < n; i++) newton[i] = -balance.residual[i];
     for (int i = 0; i < n * n; i++) factors[i] = balance.matrix[i];
-    const V sign = factor_along_the_tree(plan, factors);
-    substitute_along_the_tree(plan, factors, newton);
+    const V sign = factor(balance.branches(), factors);
+    substitute(balance.branches(), factors, newton);
     V work = against(newton);
     const M direct = (sign > V(0)) & descends(work);
     V curve = -work;  // r = −J y, and yᵀJy = −y·r
@@ -197,8 +197,8 @@ template <class V, class N, int D = 3> struct Newton {
       balance.matrix = curved;
       for (int i = 0; i < n; i++) convex[i] = -balance.residual[i];
       for (int i = 0; i < n; i++) diagonal[i] = abs(factors[i * n + i]);
-      factor_along_the_tree(plan, factors);
-      substitute_along_the_tree(plan, factors, convex);
+      factor(balance.branches(), factors);
+      substitute(balance.branches(), factors, convex);
       const V convex_work = against(convex);
       const M by_convex = descends(convex_work) & (!direct), by_newton = descends(work) & (!direct) & (!by_convex);
       for (int i = 0; i < n; i++) {

@@ -23,13 +23,14 @@ template <class V, class N, int D = 3> struct Outlook {
   int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
   V per_limit_range;
+  double close;  // which part of the work may be left: where bodies couple, evaluations cost much more than looking well
   const Relaxed<V>* relaxed;
 
   static int room(Sizes s) {
-    return int(sizeof(Coming<V>) / sizeof(V)) * s.candidates + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
+    return int(sizeof(Coming<V>) / sizeof(V)) * Balance<V, N, D>::held(s) + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
   }
-  Outlook(Sizes s, Arena<V>& arena) {
-    coming = reinterpret_cast<Coming<V>*>(arena.take(int(sizeof(Coming<V>) / sizeof(V)) * s.candidates));
+  Outlook(Sizes s, Arena<V>& arena) : close(s.bodies.rows > 0 ? 0.01 : 0.2) {
+    coming = reinterpret_cast<Coming<V>*>(arena.take(int(sizeof(Coming<V>) / sizeof(V)) * Balance<V, N, D>::held(s)));
     stops = reinterpret_cast<Stop<V>*>(arena.take(int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv));
     twist = arena.take(6 * s.nodes), drift = arena.take(6 * s.nodes);
   }
@@ -45,6 +46,10 @@ template <class V, class N, int D = 3> struct Outlook {
     each_kind(plan.contact, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) foresee(b.contacts, pair, i, where);
     });
+    if constexpr (D == 3)
+      b.meetings.slots.each_row([&](auto pair, int r) {
+        b.meetings.each_spot(r, [&](Spot<V>& spot, int held) { foresee(b.meetings, pair, r, spot, held, where); });
+      });
     for (int k = 0; k < plan.nodes; k++) {
       if (plan.kind[k] != HINGE && plan.kind[k] != SLIDE) continue;
       const int i = plan.v[k], c = plan.q[k];
@@ -83,9 +88,7 @@ template <class V, class N, int D = 3> struct Outlook {
     contacts.center(i, contacts.now, at.center);
     at.depth = contacts.depth(pair, i, contacts.now, c, at.solid);
     V v[D], a[D];
-    swing<D>(t, c, v), swing<D>(e, c, a);
-    for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
-    add_swing<D>(t, v, a);
+    move(k, c, v, a);
     if constexpr (!simple) {
       contacts.touch(pair, i, at);
       add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
@@ -108,12 +111,60 @@ template <class V, class N, int D = 3> struct Outlook {
       contacts.touch(pair, i, at);
       if constexpr (Support::rolls) add_swing<D>(t, at.arm.s, v), add_swing<D>(e, at.arm.s, a);
     }
+    come<Support>(at, v, a, sinks, faster, deepens);
+  }
+
+  // A candidate between bodies, as the one of the solid sees it.
+  template <class Pair>
+  void foresee(Meetings<V, N, D>& meetings, Pair pair, int r, const Spot<V>& spot, int held, typename Kind<V>::Mask where) {
+    const V zero(0);
+    Touching<V, 3> at;
+    at.depth = meetings.depth(pair, r, spot, meetings.now, at.center, at.solid), at.holding = relaxed->holding(held);
+    V v[3], a[3], v_other[3], a_other[3], w[3], spin[3];
+    const V *c = at.center, *n = at.solid.normal;
+    move(meetings.bodies.first[r], c, v, a), move(meetings.bodies.second[r], c, v_other, a_other);
+    for (int j = 0; j < 3; j++) {
+      w[j] = meetings.bodies.second[r] < 0 ? zero : V(-2) * twist[S * meetings.bodies.second[r] + j];
+      spin[j] = (meetings.bodies.first[r] < 0 ? zero : twist[S * meetings.bodies.first[r] + j]) + V(0.5) * w[j];
+      v[j] -= v_other[j], a[j] -= a_other[j];
+    }
+    add_cross(w, v, a);  // Coriolis: seen from a turning body
+    for (int j = 0; j < 3; j++) v_other[j] = V(-meetings.slots.radius(r)) * n[j];
+    add_cross(spin, v_other, v);
+    const V sinks = -dot(v, n), faster = -dot(a, n);
+    if (!any(((at.depth + at.solid.steepness * (max(sinks, zero) + V(0.5) * max(faster, zero)) > zero) | (at.holding > zero)) & where) &&
+        Pair::Surface::flat)
+      return;
+    meetings.touch(pair, r, spot, at);
+    V deepens = faster;
+    if constexpr (!Pair::Surface::flat) {
+      V tilt[3];
+      times(at.bend, v, tilt);
+      deepens -= dot(tilt, v);
+      const V grows = at.solid.steepness * (max(sinks, zero) + V(0.5) * max(deepens, zero));
+      if (!any(((at.depth + grows > zero) | (at.holding > zero)) & where)) return;
+    }
+    come<typename Pair::Support>(at, v, a, sinks, faster, deepens);
+  }
+  // How fast a point on a node moves, and gets faster.
+  void move(int k, const V* c, V* v, V* a) const {
+    if (k < 0) {
+      for (int j = 0; j < D; j++) v[j] = a[j] = V(0);
+      return;
+    }
+    const V *t = twist + S * k, *e = drift + S * k;
+    swing<D>(t, c, v), swing<D>(e, c, a);
+    for (int j = 0; j < D; j++) v[j] += t[T + j], a[j] += e[T + j];
+    add_swing<D>(t, v, a);
+  }
+
+  template <class Support> void come(const Touching<V, D>& at, const V* v, const V* a, V sinks, V faster, V deepens) {
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.holding = at.holding, out.per_range = at.per_range, out.per_width = at.per_width;
     V u[D];
     at.template travel<Support>(u);
-    slide(out, u, n, v, a, faster);
+    slide(out, u, at.solid.normal, v, a, faster);
   }
 
   // How the square of the slip grows that is now what u has along the plane, of a surface that moves like this.

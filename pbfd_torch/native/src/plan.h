@@ -3,6 +3,7 @@
 //
 // `Plan` walks once over two arrays that native/plan.py has written in this order: this file and that one change together.
 #pragma once
+#include "bodies.h"
 #include "candidates.h"
 
 namespace pbfd {
@@ -14,6 +15,7 @@ inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0;
 
 struct Sizes : CandidateSizes {
   int nodes, nq, nv, nu, halvings, pushes;
+  BodySizes bodies = {};
 };
 
 template <class N, int D = 3> struct Plan : Sizes {
@@ -39,13 +41,18 @@ template <class N, int D = 3> struct Plan : Sizes {
   // forces from outside
   const int* pushed;           // node
   const N *push_point, *push;  // [3] on the node, [3] in the world
+  Bodies<typename Kind<N>::Scalar> pairing;
+  const N* laws;               // [LAWS_OF_A_ROW · rows] of contact between bodies
   // the scene
   const N *gravity;  // [D]
   const N *reach;    // [m]
   const N *limit_release, *limit_per_force, *dry_speed;
 
   Plan() = default;
-  Plan(Sizes sizes, const int* ints, const N* numbers, const typename Kind<N>::Scalar* samples) : Sizes(sizes) {
+  // `body_ints`, `body_reals`: of `pairing`.
+  Plan(Sizes sizes, const int* ints, const N* numbers, const typename Kind<N>::Scalar* samples, const int* body_ints = nullptr,
+       const typename Kind<N>::Scalar* body_reals = nullptr)
+      : Sizes(sizes) {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
     parent = whole(nodes), kind = whole(nodes), q = whole(nodes), v = whole(nodes), plain = whole(nodes);
@@ -61,12 +68,14 @@ template <class N, int D = 3> struct Plan : Sizes {
     gravity = real(D), reach = real(1), limit_release = real(1), limit_per_force = real(1), dry_speed = real(1);
     contact = Candidates<N, D>(*this, ints, numbers, samples);
     pushed = whole(pushes), push_point = real(3 * pushes), push = real(3 * pushes);
+    if (bodies.rows > 0) pairing = Bodies<typename Kind<N>::Scalar>(bodies, body_ints, body_reals);
+    laws = real(LAWS_OF_A_ROW * bodies.rows);
   }
 
   static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.pushes + Candidates<N, D>::whole_numbers(s); }
   static int real_numbers(Sizes s) {
     return (2 * D * (D + 1) + 4) * s.nodes + (11 + s.halvings) * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes +
-           Candidates<N, D>::real_numbers(s);
+           LAWS_OF_A_ROW * s.bodies.rows + Candidates<N, D>::real_numbers(s);
   }
 };
 

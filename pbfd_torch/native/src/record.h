@@ -22,6 +22,7 @@ template <class T> struct Roster {
   int links, slots, first_limit;
   bool own;
   const int *carrier, *slot, *danger;
+  const int *meeting_slot, *meeting_danger;  // of contact between bodies the first ones of each group
   const T* real;
 
   // Of `real`: after the links' frames.
@@ -66,7 +67,7 @@ template <class V, class N, class Scheme> struct Recorder {
       count = last - at < W ? last - at : W;
       for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));
       place(plan, after.q, balance.now, balance.axes);
-      balance.contacts.look(balance.now);
+      balance.contacts.look(balance.now), balance.meetings.look(balance.now);
       write_state();
       if (record->suspect) write_step();
     }
@@ -182,6 +183,7 @@ template <class V, class N, class Scheme> struct Recorder {
     Contacts<V, N, D>& contacts = balance.contacts;
     scheme.begin(balance, before, guess, M(false));
     contacts.begin(balance.start, balance.target, balance.dt);
+    balance.meetings.begin(M(true), balance.start, balance.target, balance.dt, true);
     V worst = listed(roster.still_strain()), number = listed(roster.still_suspect());
     auto strained = [&](V share, int danger) {  // of those strained alike, the first
       const V this_one = V(T(danger));
@@ -196,17 +198,51 @@ template <class V, class N, class Scheme> struct Recorder {
         contacts.touch(pair, i, t);
         Force<V, D> found;
         force<typename decltype(pair)::Support>(t, found);
-        const int slot = roster.slot[i];
-        store(record->depth, &t.depth, 1, roster.slots, slot), store(record->point, found.p, D, D * roster.slots, D * slot);
-        store(record->normal, t.solid.normal, D, D * roster.slots, D * slot);
-        store(record->force, found.f, D, D * roster.slots, D * slot), store(record->slip, found.u, D, D * roster.slots, D * slot);
+        for (int j = 0; j < count; j++) show(j, roster.slot[i], t, found);
         const M far = (t.depth > V(0)) & contacts.turned_far(i);
         strained(t.depth / V(plan.contact.deep[i]) + select(far, V(1), V(0)), roster.danger[i]);
       }
     });
+    show_meetings(strained);
     if (roster.first_limit >= 0)
       each_limit(plan, after.q, [&](int i, V past) { strained(max(past, V(-1)) / V(TOO_FAR), roster.first_limit + i); });
     for (int i = 0; i < count; i++) record->suspect[at + i] = record->hazards[at + i] ? int(lane(number, i)) : -1;
+  }
+  // Between bodies: every lane has its own, and in its own slots.
+  template <class F> void show_meetings(F&& strained) {
+    Meetings<V, N, D>& meetings = balance.meetings;
+    const auto& bodies = meetings.bodies;
+    Touching<V, D> t;
+    Force<V, D> none;
+    t.depth = V(-Meetings<V, N, D>::NOWHERE);
+    for (int i = 0; i < D; i++) t.solid.normal[i] = none.p[i] = none.f[i] = none.u[i] = V(0);
+    for (int g = 0; g < bodies.groups; g++)
+      for (int i = 0; i < count; i++)
+        for (int c = 0; c < bodies.kept[g]; c++) show(i, roster.meeting_slot[g] + c, t, none);
+    meetings.slots.each_row([&](auto pair, int r) {
+      meetings.each_spot(r, [&](Spot<V>& s, int) {
+        t.depth = meetings.depth(pair, r, s, balance.now, t.center, t.solid), t.holding = V(0);
+        meetings.touch(pair, r, s, t);
+        Force<V, D> found;
+        force<typename decltype(pair)::Support>(t, found);
+        const int g = bodies.group[r];
+        for (int i = 0; i < count; i++)
+          if (lane(s.there, i) > T(0)) show(i, roster.meeting_slot[g] + int(lane(s.slot, i)), t, found);
+        const M far = (t.depth > V(0)) & meetings.turned_far(r);
+        const V deep = V(meetings.slots.laws(r)[2]);
+        strained(t.depth / deep + select(far, V(1), V(0)), roster.meeting_danger[g] + bodies.danger[r]);
+      });
+    });
+  }
+
+  // A contact of one of the steps, in a slot of its row.
+  void show(int i, int slot, const Touching<V, D>& t, const Force<V, D>& found) const {
+    const long to = long(at + i) * roster.slots + slot;
+    record->depth[to] = lane(t.depth, i);
+    for (int j = 0; j < D; j++) {
+      record->point[D * to + j] = lane(found.p[j], i), record->normal[D * to + j] = lane(t.solid.normal[j], i);
+      record->force[D * to + j] = lane(found.f[j], i), record->slip[D * to + j] = lane(found.u[j], i);
+    }
   }
 };
 

@@ -4,7 +4,7 @@
 
 namespace pbfd {
 
-constexpr double SHORTEST = 1e-4, BALANCED = 1e-2, NEAREST = 0.02, CLOSE = 0.2;
+constexpr double SHORTEST = 1e-4, BALANCED = 1e-2, NEAREST = 0.02;
 constexpr int ROUNDS = 12;
 
 // Where in a bracket to try next, 0 at its low end: a straight line there, and a parabola that sets in where something touches;
@@ -33,7 +33,7 @@ inline V first_length(const Outlook<V, N, D>& outlook, V work, V curve, typename
   // what a limit or a contact lets go of sets in like a step
   V low = zero, high = one, low_work = work, high_work = end, low_curve = curve, low_felt = work, high_felt = end;
   V best = one, best_work = end, length = one;
-  auto open = beyond & (abs(best_work) > V(CLOSE) * abs(work));
+  auto open = beyond & (abs(best_work) > V(outlook.close) * abs(work));
   for (int round = 0; round < ROUNDS && any(open); round++) {  // a lane that has enough stays: others may need more
     const V width = high - low;
     V share = low_felt / (low_felt - high_felt);
@@ -52,9 +52,9 @@ inline V first_length(const Outlook<V, N, D>& outlook, V work, V curve, typename
     high = select(longer, length, high), high_work = select(longer, f, high_work), high_curve = select(longer, df, high_curve);
     const auto better = open & (abs(f) < abs(best_work));
     best = select(better, length, best), best_work = select(better, f, best_work);
-    open = open & (abs(best_work) > V(CLOSE) * abs(work));
+    open = open & (abs(best_work) > V(outlook.close) * abs(work));
   }
-  length = select(abs(best_work) <= V(CLOSE) * abs(work), best, select(low > zero, low, length));
+  length = select(abs(best_work) <= V(outlook.close) * abs(work), best, select(low > zero, low, length));
   return select(beyond, max(length, V(SHORTEST)), one);
 }
 

@@ -47,11 +47,11 @@ struct Globe {
     const V up[3] = {V(0), V(0), V(1)};
     return unit<3>(p, up, n);
   }
-  template <class V, class N> static V field(const Candidates<N, 3>& c, int solid, const V* p, V* n) {
+  template <class V, class C> static V field(const C& c, int solid, const V* p, V* n) {
     direction(p, n);
     return dot(p, n) - V(c.measure[6 * solid]);
   }
-  template <class V, class N> static void curvature(const Candidates<N, 3>&, int, const V* p, V* out) {
+  template <class V, class C> static void curvature(const C&, int, const V* p, V* out) {
     V n[3];
     const V inverse = direction(p, n);
     around(n, inverse, V(0), out);
@@ -61,19 +61,19 @@ struct Globe {
 // Along z: radius, half length.
 struct Pill {
   static constexpr bool exact = true, convex = true;
-  template <class V, class N> static V direction(const Candidates<N, 3>& c, int solid, const V* p, V* n, V& distance, V& beside) {
+  template <class V, class C> static V direction(const C& c, int solid, const V* p, V* n, V& distance, V& beside) {
     const V half = V(c.measure[6 * solid + 1]), over = max(p[2] - half, V(0)), under = min(p[2] + half, V(0));
     const V offset[3] = {p[0], p[1], over + under}, across[3] = {V(0), V(1), V(0)};
     const V inverse = unit<3>(offset, across, n);
     distance = dot(offset, n), beside = select(abs(p[2]) < half, V(1), V(0));
     return inverse;
   }
-  template <class V, class N> static V field(const Candidates<N, 3>& c, int solid, const V* p, V* n) {
+  template <class V, class C> static V field(const C& c, int solid, const V* p, V* n) {
     V distance, beside;
     direction(c, solid, p, n, distance, beside);
     return distance - V(c.measure[6 * solid]);
   }
-  template <class V, class N> static void curvature(const Candidates<N, 3>& c, int solid, const V* p, V* out) {
+  template <class V, class C> static void curvature(const C& c, int solid, const V* p, V* out) {
     V n[3], distance, beside;
     const V inverse = direction(c, solid, p, n, distance, beside);
     around(n, inverse, beside, out);
@@ -83,18 +83,18 @@ struct Pill {
 // Half extents.
 struct Block {
   static constexpr bool exact = true, convex = true;
-  template <class V, class N> static V direction(const Candidates<N, 3>& c, int solid, const V* p, V* n, V* across, V& scale) {
+  template <class V, class C> static V direction(const C& c, int solid, const V* p, V* n, V* across, V& scale) {
     V q[3];
     for (int j = 0; j < 3; j++) q[j] = abs(p[j]) - V(c.measure[6 * solid + j]);
     const V distance = from_orthant<3>(q, n, across, scale);
     for (int j = 0; j < 3; j++) n[j] = select(p[j] < V(0), -n[j], n[j]);
     return distance;
   }
-  template <class V, class N> static V field(const Candidates<N, 3>& c, int solid, const V* p, V* n) {
+  template <class V, class C> static V field(const C& c, int solid, const V* p, V* n) {
     V across[3], scale;
     return direction(c, solid, p, n, across, scale);
   }
-  template <class V, class N> static void curvature(const Candidates<N, 3>& c, int solid, const V* p, V* out) {
+  template <class V, class C> static void curvature(const C& c, int solid, const V* p, V* out) {
     V n[3], across[3], scale;
     direction(c, solid, p, n, across, scale);
     for (int j = 0; j < 3; j++)
@@ -108,7 +108,7 @@ struct Drum {
   template <class V> struct Around {
     V outward[2], turn, g[2], across[2], scale;  // away from the axis, and 1/distance to it; of the profile
   };
-  template <class V, class N> static V direction(const Candidates<N, 3>& c, int solid, const V* p, V* n, Around<V>& at) {
+  template <class V, class C> static V direction(const C& c, int solid, const V* p, V* n, Around<V>& at) {
     const V aside[2] = {V(1), V(0)};
     at.turn = unit<2>(p, aside, at.outward);
     const V q[2] = {
@@ -117,11 +117,11 @@ struct Drum {
     n[0] = at.g[0] * at.outward[0], n[1] = at.g[0] * at.outward[1], n[2] = select(p[2] < V(0), -at.g[1], at.g[1]);
     return distance;
   }
-  template <class V, class N> static V field(const Candidates<N, 3>& c, int solid, const V* p, V* n) {
+  template <class V, class C> static V field(const C& c, int solid, const V* p, V* n) {
     Around<V> at;
     return direction(c, solid, p, n, at);
   }
-  template <class V, class N> static void curvature(const Candidates<N, 3>& c, int solid, const V* p, V* out) {
+  template <class V, class C> static void curvature(const C& c, int solid, const V* p, V* out) {
     V n[3];
     Around<V> at;
     direction(c, solid, p, n, at);

@@ -93,8 +93,8 @@ template <class V, class N, int D, class Scheme> struct Starts {
     forces_by_onset(b, end, abrupt, others, spare);
     bias(sum);
     for (int i = 0; i < plan.nv; i++) others[i] = others[i] - sum[i], by_abrupt[i] = abrupt[i], by_others[i] = others[i];
-    factor_along_the_tree(plan, momenta.matrix);
-    substitute_along_the_tree(plan, momenta.matrix, by_abrupt), substitute_along_the_tree(plan, momenta.matrix, by_others);
+    factor(tree(plan), momenta.matrix);
+    substitute(tree(plan), momenta.matrix, by_abrupt), substitute(tree(plan), momenta.matrix, by_others);
     // an impact within the step has given nothing before it; what holds the others back has, however hard they press
     for (int i = 0; i < plan.nv; i++) sum[i] = b.dt * by_abrupt[i];
     M steady = calm(plan, rates(sum), b.dt);
@@ -169,7 +169,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
     b.begin(), b.press();
     forces_by_share(b, end, rough, smooth, spare);
     for (int i = 0; i < plan.nv; i++) out.push[i] = b.dt * rough[i], sum[i] = b.dt * acceleration[i];
-    substitute_along_the_tree(plan, momenta.matrix, out.push);
+    substitute(tree(plan), momenta.matrix, out.push);
     M known(true);  // what is driven by no number is not driven by the least one
     for (int i = 0; i < plan.nu; i++) known = known & (abs(b.control[i]) <= infinite<V>());
     const V unknown = select(known, V(0), infinite<V>() - infinite<V>());
@@ -178,7 +178,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
       const V ahead = fma(V(2), b.fitted[i], V(-1)), other = fma(b.dt, force[i] - smooth[i], unknown);
       out.lag[i] = select(gains, -ahead * other, V(0)), out.push[i] = select(pushes, out.push[i], V(0));
     }
-    substitute_along_the_tree(plan, momenta.matrix, out.lag);
+    substitute(tree(plan), momenta.matrix, out.lag);
     for (int i = 0; i < plan.nq; i++) out.q[i] = before.q[i];
     for (int i = 0; i < plan.nv; i++) {
       out.v[i] = fma(V(-0.5), out.push[i] + out.lag[i], v[i]);

@@ -29,7 +29,10 @@ struct Ball {
   template <class V, class N, int D> static V reach(const Candidates<N, D>& c, int i, const V*, const V*) { return V(c.radius[i]); }
   template <bool FLAT, class V, class N, int D>
   static void arm(const Candidates<N, D>& c, int i, const V*, const V* n, const V* bend, Arm<V, D>& out) {
-    const V back = V(-c.radius[i]);
+    arm<FLAT>(V(c.radius[i]), n, bend, out);
+  }
+  template <bool FLAT, class V, int D> static void arm(V radius, const V* n, const V* bend, Arm<V, D>& out) {
+    const V back = -radius;
     for (int j = 0; j < D; j++) out.s[j] = back * n[j];
     if constexpr (!FLAT)
       for (int j = 0; j < D * D; j++) out.by_shift[j] = back * bend[j];

@@ -1,0 +1,196 @@
+"""Contact between bodies as the C++ core sees it: index tables and numbers in the order in which src/bodies.h reads them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.contact.ball_pairs import BallBoxPairs, BallCylinderPairs, BallPairs
+from pbfd_torch.contact.candidates import Finder
+from pbfd_torch.contact.hazards import Overflow
+from pbfd_torch.contact.polytope import Polytope
+from pbfd_torch.contact.polytope_pairs import PolytopePairs
+from pbfd_torch.contact.round_pairs import RoundPairs
+from pbfd_torch.native.not_compiled import unknown
+from pbfd_torch.native.plan_contact import along, laws_of
+from pbfd_torch.native.plan_hulls import hulls
+from pbfd_torch.terms.body_contact import BodyContact
+from pbfd_torch.tree.articulation import Articulation, homogeneous
+
+# What the points of a row meet, and what finds them, as src/bodies.h has them.
+CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM = range(5)
+ROUND, BALL, POLYTOPE = range(3)
+
+
+@dataclass
+class Bodies:
+    """Of all terms of contact between bodies.
+
+    Attributes:
+        frames: of the bodies [4, 4] on their nodes, obstacles after all links; nodes: −1: the world. links: how many of them are.
+        kept, finders, ends: of each term how many candidates it keeps, what finds them, and how many pairs there are up to it.
+        rows: of each its nodes, what meets what, its term and the place of its pair; sizes: its numbers, `[17]`; laws: `[*, 8]`.
+        pairs: of each its first row, its colliders, whether these are boxes, and its links; numbers: `[14]`.
+        colliders: node and link of each; places: its frame there, `[12]`; polytopes.
+        extents, slack: of each term.
+    """
+
+    frames: Tensor
+    nodes: list[int]
+    links: int
+    kept: list[int] = field(default_factory=list)
+    finders: list[int] = field(default_factory=list)
+    ends: list[int] = field(default_factory=lambda: [0])
+    rows: list[tuple[int, int, int, int, int]] = field(default_factory=list)
+    sizes: list[Tensor] = field(default_factory=list)
+    laws: list[Tensor] = field(default_factory=list)
+    pairs: list[tuple[int, int, int, int, int, int]] = field(default_factory=list)
+    numbers: list[Tensor] = field(default_factory=list)
+    colliders: list[tuple[int, int]] = field(default_factory=list)
+    places: list[Tensor] = field(default_factory=list)
+    polytopes: list[Polytope] = field(default_factory=list)
+    extents: list[Tensor] = field(default_factory=list)
+    slack: list[float] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, a: Articulation, terms: Sequence[BodyContact]) -> Bodies:
+        """Of the terms of a scene. Raises `NotCompiledError`."""
+        frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
+        obstacles = list(terms[0].obstacles) if terms else []
+        for x in obstacles:
+            if x.motion.moves:
+                raise unknown("bodies on an obstacle that moves")
+        starts = [x.start for x in obstacles]
+        if any(x.ndim > 2 for x in [frames[..., 0, :, :], *starts]):
+            raise unknown("contact between bodies whose frames differ from world to world")
+        bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *(-1 for _ in starts)], len(nodes))
+        for term in terms:
+            bodies._take(a, term)
+        return bodies
+
+    @property
+    def size(self) -> tuple[int, ...]:
+        """Of src/interface.h: links, groups, rows, pairs, colliders, slots."""
+        if not self.rows:
+            return 0, 0, 0, 0, 0, 0
+        return self.links, len(self.kept), len(self.rows), len(self.pairs), len(self.colliders), sum(self.kept)
+
+    @property
+    def whole(self) -> list[int]:
+        """The index tables."""
+        if not self.rows:
+            return []
+        tables = [*zip(*self.rows, strict=True), *zip(*(x[:4] for x in self.pairs), strict=True)]
+        links = itertools.chain(*(x[4:] for x in self.pairs))
+        colliders = zip(*self.colliders, strict=True)
+        whole = [*self.nodes[: self.links], *self.kept, *self.finders, *self.ends]
+        return [*whole, *itertools.chain(*tables), *links, *itertools.chain(*colliders), *self._hulls[0]]
+
+    @property
+    def real(self) -> Tensor:
+        """The numbers."""
+        like = self.frames
+        if not self.rows:
+            return like.new_empty(0)
+        links = [_flat(x) for x in self.frames[: self.links]]
+        tables = (links, self.extents, [like.new_tensor(self.slack)], self.places, self.numbers, self.sizes)
+        return torch.cat([*itertools.chain(*tables), self._hulls[1].to(like.dtype)])
+
+    @property
+    def _hulls(self) -> tuple[list[int], Tensor]:
+        return hulls(self.polytopes)
+
+    def _take(self, a: Articulation, term: BodyContact) -> None:
+        """Adds a term."""
+        if term.overflow is not Overflow.FLAG:
+            raise unknown(f"overflow {term.overflow.name} of contact between bodies")
+        laws = laws_of(a, term, "bodies", len(term.pairs))
+        group = len(self.kept)
+        for first, second, kind, size, place in self._rows(term.finder):
+            self.rows.append((self.nodes[first], self.nodes[second], kind, group, place))
+            self.sizes.append(torch.nn.functional.pad(size, (0, 17 - len(size))))
+            belt = self._belt(term, second) - self._belt(term, first)
+            some = [x[..., place, None] for x in laws]
+            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in some))
+            self.laws.append(torch.cat([x.expand(*batch, x.shape[-1]) for x in (*some, belt)], -1))
+        self.kept.append(term.finder.slots)
+        self.ends.append(len(self.pairs))
+        self.extents.append(term.extent[: self.links])
+        self.slack.append(term.slack)
+
+    def _belt(self, term: BodyContact, body: int) -> Tensor:
+        """Velocity of the running surface of a body in the world, `[3]`."""
+        if body < self.links:
+            return self.frames.new_zeros(3)
+        return self.frames[body, :3, :3] @ term.obstacles[body - self.links].belt
+
+    def _rows(self, finder: Finder) -> Iterator[tuple[int, int, int, Tensor, int]]:
+        """Bodies, what meets what, sizes and place of the pair of each row; pairs are added on the way."""
+        if isinstance(finder, RoundPairs):
+            self.finders.append(ROUND)
+            yield from self._round(finder)
+        elif isinstance(finder, BallPairs):
+            self.finders.append(BALL)
+            yield from self._balls(finder)
+        elif type(finder) is PolytopePairs:
+            self.finders.append(POLYTOPE)
+            yield from self._polytopes(finder)
+        else:
+            raise unknown(type(finder).__name__)
+
+    def _pair(self, row: int, a: int, b: int, numbers: Tensor, colliders: tuple[int, int] = (0, 0), boxes: bool = False) -> None:
+        """Adds one of bodies a and b."""
+        one, other = (x if x < self.links else -1 for x in (a, b))
+        self.pairs.append((row, *colliders, int(boxes), one, other))
+        self.numbers.append(torch.nn.functional.pad(numbers, (0, 14 - len(numbers))))
+
+    def _round(self, finder: RoundPairs) -> Iterator[tuple[int, int, int, Tensor, int]]:
+        tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.axes, finder.radii)
+        for place, a, b, axes, radii in zip(*tables, strict=True):
+            ends = torch.cat((self._placed(a, axes[:2]), self._placed(b, axes[2:])))
+            half = 0.5 * torch.linalg.vector_norm(ends[3] - ends[2])
+            solid = torch.stack((radii[1], half, torch.zeros_like(half), 2 * radii[1]))
+            self._pair(len(self.rows), a, b, torch.cat((ends.flatten(), radii)))
+            yield a, b, BALL_ON_PILL, torch.cat((radii[:1], _flat(along(ends[2], ends[3])), solid)), place
+
+    def _balls(self, finder: BallPairs) -> Iterator[tuple[int, int, int, Tensor, int]]:
+        frames = homogeneous(finder.frame[..., :3], finder.frame[..., 3])
+        tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.position, finder.radius, frames)
+        if isinstance(finder, BallBoxPairs):
+            kind, sizes = BALL_ON_BLOCK, finder.half_extents
+        else:
+            assert isinstance(finder, BallCylinderPairs)
+            kind, sizes = BALL_ON_DRUM, torch.nn.functional.pad(finder.size, (0, 1))
+        thickness = 2 * sizes[:, : 3 if kind == BALL_ON_BLOCK else 2].amin(-1)
+        for place, a, b, center, radius, frame, size, thick in zip(*tables, sizes, thickness, strict=True):
+            self._pair(len(self.rows), a, b, torch.cat((self._placed(a, center[None])[0], radius[None])))
+            yield a, b, kind, torch.cat((radius[None], _flat(self.frames[b] @ frame), size, thick[None])), place
+
+    def _polytopes(self, finder: PolytopePairs) -> Iterator[tuple[int, int, int, Tensor, int]]:
+        """Two rows for each pair: either may give the points."""
+        before, bodies = len(self.colliders), finder.body.tolist()
+        for body, frame in zip(bodies, finder.frame, strict=True):
+            self.colliders.append((self.nodes[body], body if body < self.links else -1))
+            self.places.append(_flat(self.frames[body] @ frame))
+        self.polytopes += finder.polytopes
+        radius = finder.table.radius
+        tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.boxes.tolist())
+        for place, one, other, boxes in zip(*tables, strict=True):
+            a, b = bodies[one], bodies[other]
+            self._pair(len(self.rows), a, b, radius.new_empty(0), (before + one, before + other), boxes)
+            for points, first, second in ((one, a, b), (other, b, a)):
+                yield first, second, BALL_ON_FACE if radius[points] > 0 else CORNER_ON_FACE, radius[points, None], place
+
+    def _placed(self, body: int, points: Tensor) -> Tensor:
+        """Points of a body on its node, `[n, 3]`."""
+        frame = self.frames[body]
+        return points @ frame[:3, :3].T + frame[:3, 3]
+
+
+def _flat(frame: Tensor) -> Tensor:
+    """A frame `[4, 4]` as src/bodies.h has it: rotation and position, `[12]`."""
+    return torch.cat((frame[:3, :3].flatten(), frame[:3, 3]))

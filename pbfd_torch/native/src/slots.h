@@ -1,0 +1,196 @@
+// The candidates between bodies of all lanes: found anew at the start of every step, each lane's own, and in the same places of the
+// same rows for all.
+#pragma once
+#include "branches.h"
+#include "facets.h"
+#include "finder.h"
+
+namespace pbfd {
+
+template <class V, class N, int D> struct Slots {
+  using T = typename Kind<V>::Scalar;
+  using M = typename Kind<V>::Mask;
+  static constexpr int W = Kind<V>::lanes;
+
+  const Plan<N, D>& plan;
+  const Bodies<T>& bodies;
+  Finder<T> finder;
+  Coupling coupling;
+  bool changed = true;  // J couples other bodies than when it was last asked
+  Poses<V> before;      // of the nodes, at the start of the step
+  V* reach;             // [groups × links] how far colliders may move without one being missed
+  V dropped;            // 1 where more was near than is kept
+  Spot<V>* spot;        // [rows × SPOTS]
+  int active, *rows;    // those with candidates in some lane
+  int *most, *count;    // [rows] in any lane, [rows × W] in each
+  int *found, *listed;   // [W × groups], [W × listed] of each lane, row · SPOTS + place of each candidate, as they were found
+  V still[12];          // the world's own pose
+
+  static int in(int bytes) { return (bytes + int(sizeof(V)) - 1) / int(sizeof(V)); }
+  static int room(Sizes s) {
+    const BodySizes& b = s.bodies;
+    if (D != 3 || b.rows == 0) return 0;
+    return b.groups * b.links + in(int(sizeof(Spot<V>)) * SPOTS * b.rows) + in(int(sizeof(int)) * ints(b)) +
+           in(int(sizeof(T)) * Finder<T>::room(b, s.nodes)) + in(Coupling::bytes(s.nodes, s.nv));
+  }
+  static int ints(const BodySizes& b) { return b.rows * (2 + W) + W * (b.groups + b.slots); }
+
+  Slots(const Plan<N, D>& scene, Arena<V>& arena)
+      : plan(scene), bodies(scene.pairing), finder(bodies, there(scene) ? plan.nodes : 0, scalars(arena)),
+        coupling(there(scene) ? plan.nodes : 0, plan.nv, there(scene) ? bytes(arena, Coupling::bytes(plan.nodes, plan.nv)) : nullptr) {
+    active = 0, dropped = V(0);
+    for (int i = 0; i < 12; i++) still[i] = V(T(i < 9 && i % 4 == 0));
+    if (!there(plan)) return;
+    reach = arena.take(bodies.groups * bodies.links);
+    spot = reinterpret_cast<Spot<V>*>(bytes(arena, int(sizeof(Spot<V>)) * SPOTS * bodies.rows));
+    rows = reinterpret_cast<int*>(bytes(arena, int(sizeof(int)) * ints(bodies)));
+    most = rows + bodies.rows, count = most + bodies.rows, found = count + W * bodies.rows, listed = found + W * bodies.groups;
+    for (int i = 0; i < bodies.rows; i++) most[i] = 0;
+    for (int i = 0; i < W * bodies.rows; i++) count[i] = 0;
+    for (int i = 0; i < W * bodies.groups; i++) found[i] = 0;
+    coupling.begin(plan);
+  }
+
+  // A step of these lanes begins at these poses, and leads to `free` without contact. `sorted`: nearest first, as in the reference.
+  void find(M which, Poses<V> start, Poses<V> free, V dt, bool sorted) {
+    before = start;
+    for (int i = 0; i < W; i++)
+      if (lane(which, i)) find(i, start, free, sorted);
+    gather();
+    for (int k = 0; k < active; k++)
+      for (int j = 0; j < most[rows[k]]; j++) begin(rows[k], spot[SPOTS * rows[k] + j], dt);
+  }
+
+  const V* rotation(Poses<V> at, int node) const { return node < 0 ? still : at.rotation + 9 * node; }
+  const V* position(Poses<V> at, int node) const { return node < 0 ? still + 9 : at.position + 3 * node; }
+  // A point as the body of a row's solid sees it.
+  void seen(int row, Poses<V> at, const V* x, V* out) const {
+    const V* p = position(at, bodies.second[row]);
+    const V off[3] = {x[0] - p[0], x[1] - p[1], x[2] - p[2]};
+    transposed_times(rotation(at, bodies.second[row]), off, out);
+  }
+  void center(int row, const Spot<V>& s, Poses<V> at, V* out) const {
+    times(rotation(at, bodies.first[row]), s.position, out);
+    for (int j = 0; j < 3; j++) out[j] += position(at, bodies.first[row])[j];
+  }
+  const T* solid(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 1; }
+  T radius(int row) const { return bodies.of_row[NUMBERS_OF_A_ROW * row]; }
+  const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
+
+  // Where a candidate of a group is in a lane.
+  int* slot(int group, int i, int which) const {
+    int first = 0;
+    for (int g = 0; g < group; g++) first += bodies.kept[g];
+    return listed + W * first + bodies.kept[group] * i + which;
+  }
+
+  // visit(what a row's points touch, the row) of rows that have any.
+  template <class F> void each_row(F&& visit) const {
+    for (int k = 0; k < active; k++) {
+      const int r = rows[k];
+      switch (bodies.meeting[r]) {
+        case CORNER_ON_FACE: visit(Pair<Face, Point>(), r); break;
+        case BALL_ON_FACE: visit(Pair<Face, Ball>(), r); break;
+        case BALL_ON_PILL: visit(Pair<Guarded<Pill>, Ball>(), r); break;
+        case BALL_ON_BLOCK: visit(Pair<Guarded<Block>, Ball>(), r); break;
+        case BALL_ON_DRUM: visit(Pair<Guarded<Drum>, Ball>(), r); break;
+      }
+    }
+  }
+
+  // How far the farthest collider of a link moves at most.
+  V travel(int group, int link, Poses<V> from, Poses<V> to) const {
+    const int k = bodies.node[link];
+    if (k < 0) return V(0);
+    V turn[9], moved[9], shift[3];
+    const T* frame = bodies.frame + 12 * link;
+    for (int j = 0; j < 9; j++) turn[j] = to.rotation[9 * k + j] - from.rotation[9 * k + j];
+    product(turn, frame, moved), times(turn, frame + 9, shift);
+    V chord(0);
+    for (int j = 0; j < 9; j++) chord = fma(moved[j], moved[j], chord);
+    for (int j = 0; j < 3; j++) shift[j] += to.position[3 * k + j] - from.position[3 * k + j];
+    return fma(V(bodies.extent[group * bodies.links + link]), sqrt(V(0.5) * chord), sqrt(dot(shift, shift)));
+  }
+
+ private:
+  static bool there(const Plan<N, D>& plan) { return D == 3 && plan.bodies.rows > 0; }
+  static char* bytes(Arena<V>& arena, int size) { return reinterpret_cast<char*>(arena.take(in(size))); }
+  T* scalars(Arena<V>& arena) const {
+    return there(plan) ? reinterpret_cast<T*>(bytes(arena, int(sizeof(T)) * Finder<T>::room(bodies, plan.nodes))) : nullptr;
+  }
+
+  void find(int i, Poses<V> start, Poses<V> free, bool sorted) {
+    for (int k = 0; k < plan.nodes; k++) copy(start, k, i, finder.start[k]), copy(free, k, i, finder.ahead[k]);
+    for (int g = 0; g < bodies.groups; g++)
+      for (int c = 0; c < found[W * g + i]; c++) {  // what it had
+        const int at = *slot(g, i, c);
+        put(spot[at].there, i, T(0)), count[W * (at / SPOTS) + i] = 0;
+      }
+    bool more = false;
+    for (int g = 0; g < bodies.groups; g++) {
+      for (int l = 0; l < bodies.links; l++) {
+        const int at = g * bodies.links + l;
+        put(reach[at], i, finder.reach[at] = finder.reach_of_free_motion(g, l));
+      }
+      more = finder.find(g, sorted) || more;
+      found[W * g + i] = finder.count;
+      for (int c = 0; c < finder.count; c++) put(spot[*slot(g, i, c) = settle(i, finder.found[finder.order[c]])].slot, i, T(c));
+    }
+    put(dropped, i, T(more));
+  }
+  static void copy(Poses<V> from, int k, int i, Pose<T>& to) {
+    for (int j = 0; j < 9; j++) to.rotation[j] = lane(from.rotation[9 * k + j], i);
+    for (int j = 0; j < 3; j++) to.position[j] = lane(from.position[3 * k + j], i);
+  }
+
+  // A lane's candidate in a place of its row; which.
+  int settle(int i, const Found<T>& c) {
+    const int place = count[W * c.row + i]++, at = SPOTS * c.row + place;
+    Spot<V>& s = spot[at];
+    if (place >= most[c.row]) s.clear(), most[c.row] = place + 1;  // no lane has had it
+    put(s.there, i, T(1)), put(s.offset, i, c.offset), put(s.passed, i, T(c.passed)), put(s.near, i, T(c.near));
+    for (int j = 0; j < 3; j++) put(s.position[j], i, c.position[j]), put(s.normal[j], i, c.normal[j]);
+    return at;
+  }
+
+  // Which rows have candidates in some lane, and which bodies these couple.
+  void gather() {
+    bool* wanted = coupling.wanted;
+    for (int i = 0; i < plan.nodes * plan.nodes; i++) wanted[i] = false;
+    active = 0;
+    for (int r = 0; r < bodies.rows; r++) {
+      if (most[r] == 0) continue;
+      most[r] = 0;
+      for (int i = 0; i < W; i++) most[r] = most[r] > count[W * r + i] ? most[r] : count[W * r + i];
+      if (most[r] == 0) continue;
+      rows[active++] = r;
+      const int a = bodies.first[r], b = bodies.second[r];
+      if (a >= 0 && b >= 0) wanted[plan.nodes * (a > b ? a : b) + (a > b ? b : a)] = true;
+    }
+    changed = coupling.renew(plan) || changed;
+  }
+
+  // Where it is at the start, as the solid's body sees it.
+  void begin(int row, Spot<V>& s, V dt) {
+    V c[3], ran[3], belt[3];
+    center(row, s, before, c), seen(row, before, c, s.start);
+    for (int j = 0; j < 3; j++) belt[j] = V(laws(row)[5 + j]);
+    transposed_times(rotation(before, bodies.second[row]), belt, ran);
+    s.began = depth(row, s, s.start);
+    for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);
+  }
+
+  // At a point as the solid's body sees it.
+  V depth(int row, const Spot<V>& s, const V* own) const {
+    Beside<V, 3> beside;
+    switch (bodies.meeting[row]) {
+      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
+      default: Face::beside(s, solid(row), own, beside);
+    }
+    return V(radius(row)) - beside.distance;
+  }
+};
+
+}  // namespace pbfd
