@@ -28,7 +28,7 @@ class _Plan(ctypes.Structure):
             )
         ),
         *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),
-        *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots")),
+        *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots", "remembered")),
         *((name, ctypes.c_void_p) for name in ("body_whole", "body_real")),
     )
 

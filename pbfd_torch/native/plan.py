@@ -45,7 +45,8 @@ class Plan:
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
     μ: the core knows these in space only, and not with BDF2. order: where the candidates are among those of all contact terms.
-    anchors: how many each contact has, in the order of a state's memory. seats: where links are on the nodes."""
+    memory: of each term that remembers, in the order of a state's memory, where it begins among all numbers that are remembered,
+    and its shape; remembered: how many these are. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -57,7 +58,8 @@ class Plan:
     dimension: int
     apart: bool
     order: tuple[int, ...]
-    anchors: tuple[int, ...]
+    memory: tuple[tuple[int, int, int], ...]
+    remembered: int
     seats: Seats
 
     def take(self, worlds: Worlds) -> Plan:
@@ -104,6 +106,7 @@ class _Parts:
     joints: Sequence[Tensor]
     scene: Sequence[Tensor]
     pushes: Sequence[Tensor]
+    memory: tuple[tuple[int, int, int], ...]
     dimension: int = 3
 
     @property
@@ -142,7 +145,8 @@ class _Parts:
             dimension=self.dimension,
             apart=self.apart,
             order=candidates.order,
-            anchors=tuple(candidates.anchors),
+            memory=self.memory,
+            remembered=3 * sum(candidates.anchors) + self.bodies.remembered,
             seats=Seats.of(a),
         )
 
@@ -164,14 +168,30 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
-        bodies=Bodies.of(a, known.meetings),
+        bodies=(bodies := Bodies.of(a, known.meetings, 3 * sum(known.candidates.anchors))),
         driven=driven,
         pushed=known.pushed,
         halvings=len(shares) - 1,
         joints=joints,
         scene=[reach(a)[..., None], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
         pushes=[x[k].flatten(-2) for k in range(2) for x in known.pushes],
+        memory=_memory(stepper.terms, known.candidates.anchors, bodies),
     )
+
+
+def _memory(terms: Sequence[Any], anchors: Sequence[int], bodies: Bodies) -> tuple[tuple[int, int, int], ...]:
+    """See `Plan`."""
+    found, contacts, meetings = [], iter(anchors), iter(zip(bodies.memory, bodies.kept, strict=True))
+    taken = 0
+    for term in terms:
+        if isinstance(term, BodyContact):
+            first, count = next(meetings)
+            found.append((max(first, 0), count if first >= 0 else 0, 7))
+        elif isinstance(term, Contact):
+            count = next(contacts)
+            found.append((taken, count, 3))
+            taken += 3 * count
+    return tuple(found)
 
 
 def _told_apart(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

@@ -18,6 +18,7 @@ from pbfd_torch.contact.round_pairs import RoundPairs
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import along, laws_of
 from pbfd_torch.native.plan_hulls import hulls
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
@@ -33,10 +34,10 @@ class Bodies:
     Attributes:
         frames: of the bodies [4, 4] on their nodes, obstacles after all links; nodes: −1: the world. links: how many of them are.
         kept, finders, ends: of each term how many candidates it keeps, what finds them, and how many pairs there are up to it.
-        rows: of each its nodes, what meets what, its term and the place of its pair; sizes: its numbers, `[17]`; laws: `[*, 8]`.
+        rows: of each its nodes, what meets what, its term and the place of its pair; sizes: its numbers, `[41]`; laws: `[*, 8]`.
         pairs: of each its first row, its colliders, whether these are boxes, and its links; numbers: `[14]`.
         colliders: node and link of each; places: its frame there, `[12]`; polytopes.
-        extents, slack: of each term.
+        extents, slack: of each term. memory: where what its anchors remember begins, −1: it has none; remembered: how much in all.
     """
 
     frames: Tensor
@@ -55,10 +56,12 @@ class Bodies:
     polytopes: list[Polytope] = field(default_factory=list)
     extents: list[Tensor] = field(default_factory=list)
     slack: list[float] = field(default_factory=list)
+    memory: list[int] = field(default_factory=list)
+    remembered: int = 0
 
     @classmethod
-    def of(cls, a: Articulation, terms: Sequence[BodyContact]) -> Bodies:
-        """Of the terms of a scene. Raises `NotCompiledError`."""
+    def of(cls, a: Articulation, terms: Sequence[BodyContact], before: int) -> Bodies:
+        """Of the terms of a scene, where other contacts remember so many numbers `before` these. Raises `NotCompiledError`."""
         frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
         obstacles = list(terms[0].obstacles) if terms else []
         for x in obstacles:
@@ -69,15 +72,16 @@ class Bodies:
             raise unknown("contact between bodies whose frames differ from world to world")
         bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *(-1 for _ in starts)], len(nodes))
         for term in terms:
-            bodies._take(a, term)
+            bodies._take(a, term, before)
         return bodies
 
     @property
     def size(self) -> tuple[int, ...]:
-        """Of src/interface.h: links, groups, rows, pairs, colliders, slots."""
+        """Of src/interface.h: links, groups, rows, pairs, colliders, slots, remembered."""
         if not self.rows:
-            return 0, 0, 0, 0, 0, 0
-        return self.links, len(self.kept), len(self.rows), len(self.pairs), len(self.colliders), sum(self.kept)
+            return 0, 0, 0, 0, 0, 0, 0
+        counts = len(self.kept), len(self.rows), len(self.pairs), len(self.colliders)
+        return self.links, *counts, sum(self.kept), self.remembered
 
     @property
     def whole(self) -> list[int]:
@@ -87,7 +91,7 @@ class Bodies:
         tables = [*zip(*self.rows, strict=True), *zip(*(x[:4] for x in self.pairs), strict=True)]
         links = itertools.chain(*(x[4:] for x in self.pairs))
         colliders = zip(*self.colliders, strict=True)
-        whole = [*self.nodes[: self.links], *self.kept, *self.finders, *self.ends]
+        whole = [*self.nodes[: self.links], *self.kept, *self.finders, *self.ends, *self.memory]
         return [*whole, *itertools.chain(*tables), *links, *itertools.chain(*colliders), *self._hulls[0]]
 
     @property
@@ -104,7 +108,7 @@ class Bodies:
     def _hulls(self) -> tuple[list[int], Tensor]:
         return hulls(self.polytopes)
 
-    def _take(self, a: Articulation, term: BodyContact) -> None:
+    def _take(self, a: Articulation, term: BodyContact, before: int) -> None:
         """Adds a term."""
         if term.overflow is not Overflow.FLAG:
             raise unknown(f"overflow {term.overflow.name} of contact between bodies")
@@ -112,12 +116,16 @@ class Bodies:
         group = len(self.kept)
         for first, second, kind, size, place in self._rows(term.finder):
             self.rows.append((self.nodes[first], self.nodes[second], kind, group, place))
-            self.sizes.append(torch.nn.functional.pad(size, (0, 17 - len(size))))
+            frames = (_flat(self.frames[first]), _flat(self.frames[second]))
+            self.sizes.append(torch.cat((torch.nn.functional.pad(size, (0, 17 - len(size))), *frames)))
             belt = self._belt(term, second) - self._belt(term, first)
             some = [x[..., place, None] for x in laws]
             batch = torch.broadcast_shapes(*(x.shape[:-1] for x in some))
             self.laws.append(torch.cat([x.expand(*batch, x.shape[-1]) for x in (*some, belt)], -1))
         self.kept.append(term.finder.slots)
+        anchored = isinstance(term.friction, AnchoredFriction)
+        self.memory.append(before + self.remembered if anchored else -1)
+        self.remembered += 7 * term.finder.slots if anchored else 0
         self.ends.append(len(self.pairs))
         self.extents.append(term.extent[: self.links])
         self.slack.append(term.slack)

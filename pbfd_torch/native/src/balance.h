@@ -185,6 +185,10 @@ template <class V, class N, int D = 3> struct Balance {
     contacts.each_normal_force(at, visit), meetings.each_normal_force(at, visit);
   }
 
+  // What anchors remember of the start of the step; and at its end, where the nodes are now and the contacts have looked.
+  void recall(const V* memory) { contacts.behind = memory, meetings.slots.behind = memory; }
+  void remember(V* memory) { contacts.remember(memory), meetings.remember(memory); }
+
   JointStep<V> steps() const { return {q_start, q_target, control, limits, fitted, dt, inert, relaxed}; }
 
  private:

@@ -12,7 +12,7 @@ template <class V> struct FourPoses {
   V *q, *history, *moves, *push, *behind;
   template <class F> static void each(Sizes s, F&& visit) {
     visit(&FourPoses::q, s.nq), visit(&FourPoses::history, 36 * s.nodes), visit(&FourPoses::moves, 3 * s.nv);
-    visit(&FourPoses::push, 1), visit(&FourPoses::behind, 3 * s.anchors);
+    visit(&FourPoses::push, 1), visit(&FourPoses::behind, s.remembered());
   }
 };
 

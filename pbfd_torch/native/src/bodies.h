@@ -9,9 +9,9 @@
 
 namespace pbfd {
 
-// How many there are; slots: of all groups.
+// How many there are; slots: of all groups; remembered: numbers that anchors remember.
 struct BodySizes {
-  int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0;
+  int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0, remembered = 0;
 };
 
 // What a row's points touch, and with what: planes by points or balls, and solids by balls.
@@ -21,12 +21,15 @@ enum FinderKind { ROUND_PAIRS, BALL_PAIRS, POLYTOPE_PAIRS };
 
 constexpr int SPOTS = 8;          // points of a row at most
 constexpr int NUMBERS_OF_A_PAIR = 14;  // round ones: the ends of both axes on their nodes, and radii; a ball's centre and radius
-constexpr int NUMBERS_OF_A_ROW = 17;   // radius of the points; of a solid frame [12], sizes [3], thickness
+// radius of the points; of a solid frame [12], sizes [3], thickness; frames [12] of both bodies on their nodes
+constexpr int NUMBERS_OF_A_ROW = 41;
+constexpr int NUMBERS_OF_AN_ANCHOR = 7;  // what it is behind by [3], where its point is [3], in the bodies' own frames; its pair
 constexpr int LAWS_OF_A_ROW = 8;       // C⊥, μ, deep, 1/release, 1/width, velocity [3] of a belt in the world: + the solid's, − the points'
 
 template <class T> struct Bodies : BodySizes {
   const int* node;         // [links]
   const int *kept, *finder, *first_pair;  // [groups], [groups], [groups + 1]: how many candidates it keeps, what it is, its pairs
+  const int* memory;  // [groups] where what anchors remember of it begins among all that is remembered; −1: it has none
   const int *first, *second, *meeting, *group, *danger;  // [rows]: nodes, what touches what, whose it is, which pair of the term's
   const int *row, *one, *other, *boxes;  // [pairs]: its first row; of polytopes, its colliders and whether both are boxes
   const int* link;  // [2 · pairs] whose colliders these are; −1: of what does not move
@@ -39,7 +42,7 @@ template <class T> struct Bodies : BodySizes {
   Bodies(BodySizes sizes, const int* ints, const T* reals) : BodySizes(sizes) {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const T* here = reals; reals += count; return here; };
-    node = whole(links), kept = whole(groups), finder = whole(groups), first_pair = whole(groups + 1);
+    node = whole(links), kept = whole(groups), finder = whole(groups), first_pair = whole(groups + 1), memory = whole(groups);
     first = whole(rows), second = whole(rows), meeting = whole(rows), group = whole(rows), danger = whole(rows);
     row = whole(pairs), one = whole(pairs), other = whole(pairs), boxes = whole(pairs), link = whole(2 * pairs);
     collider_node = whole(colliders), collider_link = whole(colliders);

@@ -11,11 +11,12 @@ template <class V> struct Spot {
   V normal[3], offset;    // of the plane
   V passed, near;         // 1 or 0, see finder.h
   V slot;                 // its place among the candidates of its lane
+  V anchor[3];            // what its anchor is behind by as the solid's node sees it
   V start[3], began;      // where the solid's body sees the point at the start, less what its belt runs; and how deep it is there
 
   void clear() {
     there = slot = offset = passed = near = began = V(0);
-    for (int j = 0; j < 3; j++) position[j] = normal[j] = start[j] = V(0);
+    for (int j = 0; j < 3; j++) position[j] = normal[j] = anchor[j] = start[j] = V(0);
   }
 };
 

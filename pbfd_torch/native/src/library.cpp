@@ -22,7 +22,7 @@ namespace {
 Sizes sizes(const pbfd_plan* p) {
   const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
   return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
-          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots}};
+          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}};
 }
 
 template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* given, void* const* found) {
@@ -102,7 +102,7 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
   with_each<T, D>(p, s->own, {static_cast<T*>(room)}, [&](const Plan<T, D>& plan, Numbers<T>& own, const T*, Arena<T>& arena) {
     for (int w = s->first; w < s->last; w++) {
       own.load(0, w);
-      inspect(plan, p->anchors ? row(s->given[9], w, 3 * p->anchors) : nullptr, row(s->given[0], w, p->nq),
+      inspect(plan, plan.remembered() ? row(s->given[9], w, plan.remembered()) : nullptr, row(s->given[0], w, p->nq),
               row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt), arena,
               static_cast<T*>(residual) + long(w) * p->nv, static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
     }

@@ -41,7 +41,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
-    newton.balance.contacts.behind = before.behind;
+    newton.balance.recall(before.behind);
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
   }
 
@@ -215,7 +215,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
     const M refused = scheme.advance(b, newton.q, before, after, eased);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
-    if (plan.anchors > 0) b.contacts.remember(after.behind);
+    if (plan.remembered() > 0) b.remember(after.behind);
     M kept(false), solved(false), failed(false), part(false), lost(false);
     const Hazards<V> seen = look_for_hazards();
     for (int i = 0; i < W; i++) {

@@ -137,6 +137,22 @@ template <class V, class N, int D> struct Meetings {
     return found;
   }
 
+  bool anchored(int r) const { return bodies.memory[bodies.group[r]] >= 0; }
+
+  // What anchors remember after a step of the step's own problem that ended where the nodes are now, see `Contacts::remember`: each
+  // lane of its own candidates, in its own slots.
+  [[gnu::noinline]] void remember(V* memory) {
+    if constexpr (D == 3) {
+      if (bodies.remembered == 0) return;
+      for (int j = 0; j < bodies.remembered; j++)
+        memory[3 * plan.anchors + j] = V(T(j % NUMBERS_OF_AN_ANCHOR == NUMBERS_OF_AN_ANCHOR - 1 ? -1 : 0));
+      slots.each_row([&](auto pair, int r) {
+        if (!anchored(r)) return;
+        each_spot(r, [&](Spot<V>& s, int) { keep(pair, r, s, memory + bodies.memory[bodies.group[r]]); });
+      });
+    }
+  }
+
   // visit(spot, its number among all candidates)
   template <class F> void each_spot(int r, F&& visit) const {
     for (int j = 0; j < slots.most[r]; j++) visit(slots.spot[SPOTS * r + j], plan.candidates + SPOTS * r + j);
@@ -156,7 +172,8 @@ template <class V, class N, int D> struct Meetings {
     using Surface = typename Pair::Surface;
     const V *R = slots.rotation(now, bodies.second[r]), *p = slots.position(now, bodies.second[r]);
     V carried[3];
-    times(R, s.start, carried);
+    const V start[3] = {s.start[0] - s.anchor[0], s.start[1] - s.anchor[1], s.start[2] - s.anchor[2]};
+    times(R, start, carried);
     for (int j = 0; j < 3; j++) t.moved[j] = t.center[j] - (carried[j] + p[j]);
     t.start = s.began;
     if constexpr (!Surface::flat) {
@@ -175,10 +192,35 @@ template <class V, class N, int D> struct Meetings {
     }
     const N* law = slots.laws(r);
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
-    t.per_range = per_dt * V(law[3]), t.per_width = per_dt * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
+    t.per_range = per_dt * V(law[3]), t.per_width = (anchored(r) ? V(1) : per_dt) * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
   }
 
  private:
+  template <class Pair> void keep(Pair pair, int r, const Spot<V>& s, V* memory) {
+    Touching<V, 3> t;
+    V u[3], seen[3], kept[3], off[3], x[3], F[9];
+    t.depth = depth(pair, r, s, now, t.center, t.solid);
+    touch(pair, r, s, t);
+    t.template slip<typename Pair::Support>(u);
+    const M holds = t.depth > V(0);
+    const V part = select(holds, V(1) / max(V(slots.laws(r)[4]) * sqrt(dot(u, u)), V(1)), V(0));
+    for (int j = 0; j < 3; j++) u[j] = part * u[j];
+    const T* frames = slots.own_frames(r);
+    transposed_times(slots.rotation(now, bodies.second[r]), u, seen);
+    for (int j = 0; j < 9; j++) F[j] = V(frames[12 + j]);
+    transposed_times(F, seen, kept);
+    for (int j = 0; j < 9; j++) F[j] = V(frames[j]);
+    for (int j = 0; j < 3; j++) off[j] = s.position[j] - V(frames[9 + j]);
+    transposed_times(F, off, x);
+    const V number = select(holds, V(T(bodies.danger[r])), V(-1));
+    for (int i = 0; i < Kind<V>::lanes; i++) {
+      if (!(lane(s.there, i) > T(0))) continue;
+      V* out = memory + NUMBERS_OF_AN_ANCHOR * int(lane(s.slot, i));
+      for (int j = 0; j < 3; j++) put(out[j], i, lane(kept[j], i)), put(out[3 + j], i, lane(x[j], i));
+      put(out[6], i, lane(number, i));
+    }
+  }
+
   // How the one body has turned since the start as the other one sees it, in the world's axes now.
   [[gnu::noinline]] void turn(int r) {
     const int a = bodies.first[r], b = bodies.second[r];

@@ -16,6 +16,8 @@ inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0;
 struct Sizes : CandidateSizes {
   int nodes, nq, nv, nu, halvings, pushes;
   BodySizes bodies = {};
+
+  int remembered() const { return 3 * anchors + bodies.remembered; }  // numbers that anchors remember
 };
 
 template <class N, int D = 3> struct Plan : Sizes {

@@ -62,7 +62,7 @@ template <class V, class N, class Scheme> struct Recorder {
   // Of steps first … last − 1 of all steps of all worlds.
   void write(const Record<T>& to, int first, int last) {
     record = &to;
-    balance.dt = V(to.dt), balance.contacts.behind = before.behind;
+    balance.dt = V(to.dt), balance.recall(before.behind);
     for (at = first; at < last; at += W) {
       count = last - at < W ? last - at : W;
       for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));

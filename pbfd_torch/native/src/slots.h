@@ -18,6 +18,7 @@ template <class V, class N, int D> struct Slots {
   Coupling coupling;
   bool changed = true;  // J couples other bodies than when it was last asked
   Poses<V> before;      // of the nodes, at the start of the step
+  const V* behind = nullptr;  // what anchors remember
   V* reach;             // [groups × links] how far colliders may move without one being missed
   V dropped;            // 1 where more was near than is kept
   Spot<V>* spot;        // [rows × SPOTS]
@@ -74,6 +75,7 @@ template <class V, class N, int D> struct Slots {
     for (int j = 0; j < 3; j++) out[j] += position(at, bodies.first[row])[j];
   }
   const T* solid(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 1; }
+  const T* own_frames(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 17; }
   T radius(int row) const { return bodies.of_row[NUMBERS_OF_A_ROW * row]; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
 
@@ -132,11 +134,34 @@ template <class V, class N, int D> struct Slots {
         const int at = g * bodies.links + l;
         put(reach[at], i, finder.reach[at] = finder.reach_of_free_motion(g, l));
       }
-      more = finder.find(g, sorted) || more;
+      more = finder.find(g, sorted || bodies.memory[g] >= 0) || more;
       found[W * g + i] = finder.count;
-      for (int c = 0; c < finder.count; c++) put(spot[*slot(g, i, c) = settle(i, finder.found[finder.order[c]])].slot, i, T(c));
+      for (int c = 0; c < finder.count; c++) {
+        const Found<T>& one = finder.found[finder.order[c]];
+        Spot<V>& s = spot[*slot(g, i, c) = settle(i, one)];
+        put(s.slot, i, T(c));
+        if (bodies.memory[g] >= 0) inherit(g, i, one, s);
+      }
     }
     put(dropped, i, T(more));
+  }
+  // What the anchor is behind by of the nearest candidate of the same pair in the step before.
+  void inherit(int g, int i, const Found<T>& one, Spot<V>& s) const {
+    const T* frames = own_frames(one.row);
+    T nearest(HUGE_VAL), x[3], off[3], kept[3] = {}, anchor[3];
+    for (int j = 0; j < 3; j++) off[j] = one.position[j] - frames[9 + j];
+    transposed_times(frames, off, x);
+    for (int m = 0; m < bodies.kept[g]; m++) {
+      const V* memory = behind + bodies.memory[g] + NUMBERS_OF_AN_ANCHOR * m;
+      if (lane(memory[6], i) != T(bodies.danger[one.row])) continue;
+      for (int j = 0; j < 3; j++) off[j] = x[j] - lane(memory[3 + j], i);
+      const T distance = dot(off, off);
+      if (!(distance < nearest)) continue;
+      nearest = distance;
+      for (int j = 0; j < 3; j++) kept[j] = lane(memory[j], i);
+    }
+    times(frames + 12, kept, anchor);
+    for (int j = 0; j < 3; j++) put(s.anchor[j], i, anchor[j]);
   }
   static void copy(Poses<V> from, int k, int i, Pose<T>& to) {
     for (int j = 0; j < 9; j++) to.rotation[j] = lane(from.rotation[9 * k + j], i);
