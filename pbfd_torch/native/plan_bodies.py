@@ -28,7 +28,6 @@ from pbfd_torch.tree.articulation import Articulation, homogeneous
 CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM, RIM_ON_FACE, ROUND_ON_ROUND = range(7)
 ROUND, BALL, POLYTOPE, CURVED, CLOSEST = range(5)
 NUMBERS_OF_A_PAIR, NUMBERS_OF_A_ROW = 14, 25
-POINT = 1e-12  # [m] what a point reaches (terms/supported.py)
 
 
 @dataclass
@@ -186,7 +185,7 @@ class Bodies:
             self.places.append(_flat(self.frames[body] @ frame))
         self.polytopes += finder.polytopes
         table, curved = finder.table, isinstance(finder, CurvedPairs)
-        radius = table.radius + (POINT if curved else 0.0)
+        radius = table.radius
         tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.boxes.tolist())
         for place, one, other, boxes in zip(*tables, strict=True):
             a, b = bodies[one], bodies[other]
@@ -195,10 +194,10 @@ class Bodies:
             self._pair(len(self.rows), a, b, numbers, (before + one, before + other), boxes)
             for points, first, second in ((one, a, b), (other, b, a)):
                 if not table.curved[points] and (met is None or turned is (points == one)):
-                    kind = BALL_ON_FACE if table.radius[points] > 0 else CORNER_ON_FACE
+                    kind = BALL_ON_FACE if radius[points] > 0 else CORNER_ON_FACE
                     yield first, second, kind, radius[points, None], place
                     continue
-                size = torch.cat((table.radius[points, None], shape_row(finder, points, self.frames[first])))
+                size = torch.cat((radius[points, None], shape_row(finder, points, self.frames[first])))
                 if met is None or turned is (points == one):
                     yield first, second, RIM_ON_FACE, size, place
                 else:

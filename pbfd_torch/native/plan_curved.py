@@ -10,8 +10,8 @@ from pbfd_torch.contact.polytope_pairs import PolytopePairs
 
 
 def round_table(finder: PolytopePairs, one: int, other: int) -> tuple[RoundTable, bool] | None:
-    """Two colliders in the frames of their bodies, the one that gives the point first, and whether that is the other one; None where
-    they are not both round."""
+    """Two colliders in the frames of their bodies, the one that gives the point first, and whether that is the other one; None
+    where they are not both round."""
     shapes = []
     for k in (one, other):
         polytope = finder.polytopes[k]

@@ -49,7 +49,8 @@ def _numbers(polytope: Polytope, rings: list[list[int]]) -> NDArray[np.float64]:
     vertices, rim = polytope.vertices, polytope.rim
     size = 0.5 * float(np.linalg.norm(np.ptp(vertices, axis=0))) + polytope.radius
     form, half = ((*rim.form,), rim.half) if rim else ((0.0, 0.0, 0.0), 0.0)
-    alone = np.array([polytope.radius, size, polytope.thickness, *form, half, *vertices.max(0), *vertices.mean(0), _bulge(polytope)])
+    sizes = polytope.radius, size, polytope.thickness
+    alone = np.array([*sizes, *form, half, *vertices.max(0), *vertices.mean(0), _bulge(polytope)])
     start, end = (vertices[polytope.edges[:, k]] for k in (0, 1))
     along = end - start
     length = np.linalg.norm(along, axis=1, keepdims=True)

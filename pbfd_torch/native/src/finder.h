@@ -232,6 +232,8 @@ template <class T> struct Finder {
       times(points, point, out.position), times(plane, met.normal, out.normal);
       for (int j = 0; j < 3; j++) out.position[j] += points[9 + j];
       out.offset = met.offset + dot(out.normal, plane + 9);
+      // beside curved bodies points reach a little too (terms/supported.py)
+      if (bodies.finder[group] == CURVED_PAIRS && bodies.meeting[out.row] < CURVED) out.offset += T(Ellipsoid::POINT);
       return out;
     };
     for (int i = 0; i < met.count; i++) {
