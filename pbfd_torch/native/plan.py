@@ -26,6 +26,7 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.curved_body_contact import CurvedBodyContact
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
@@ -35,7 +36,7 @@ from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
-CONTACTS = (Contact, CurvedContact, BodyContact)
+CONTACTS = (Contact, CurvedContact, BodyContact, CurvedBodyContact)
 TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Pushes, *CONTACTS)
 
 

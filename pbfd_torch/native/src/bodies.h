@@ -14,15 +14,22 @@ struct BodySizes {
   int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0, remembered = 0;
 };
 
-// What a row's points touch, and with what: planes by points or balls, and solids by balls.
-enum Meeting { CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM };
+// What a row's points touch, and with what: planes by points or balls, and solids by balls; from CURVED on, where curved bodies give
+// the points, planes by ellipsoids and what holds these, and there also where round bodies come closest.
+enum Meeting { CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM, RIM_ON_FACE, ROUND_ON_ROUND };
+constexpr int CURVED = RIM_ON_FACE;
 // Who finds the pairs of a group.
-enum FinderKind { ROUND_PAIRS, BALL_PAIRS, POLYTOPE_PAIRS };
+enum FinderKind { ROUND_PAIRS, BALL_PAIRS, POLYTOPE_PAIRS, CURVED_PAIRS, CLOSEST_PAIRS };
 
-constexpr int SPOTS = 8;          // points of a row at most
-constexpr int NUMBERS_OF_A_PAIR = 14;  // round ones: the ends of both axes on their nodes, and radii; a ball's centre and radius
-// radius of the points; of a solid frame [12], sizes [3], thickness; frames [12] of both bodies on their nodes
-constexpr int NUMBERS_OF_A_ROW = 41;
+constexpr int RIMS = 2;                // of a curved body at most
+constexpr int SPOTS = 8 + RIMS;        // points of a row at most
+// Round ones: the ends of both axes on their nodes, and radii; a ball's centre and radius; of shapes that may touch where they come
+// closest the centres on their nodes, half lengths, half the thickness of the thinner one, whether they have flat caps, whether the
+// second one gives the point, the radii around both together, and 1 for such a pair, else 0 (closest.h).
+constexpr int NUMBERS_OF_A_PAIR = 14;
+// Radius of the points; of a solid frame [12], sizes [3], thickness; of curved bodies the form [9] of what gives the points and its
+// axis [3] on its node, and the same of the other one where it is round; from the 25th on frames [12] of both bodies on their nodes.
+constexpr int OWN_FRAMES = 25, NUMBERS_OF_A_ROW = 49;
 constexpr int NUMBERS_OF_AN_ANCHOR = 7;  // what it is behind by [3], where its point is [3], in the bodies' own frames; its pair
 constexpr int LAWS_OF_A_ROW = 8;       // C⊥, μ, deep, 1/release, 1/width, velocity [3] of a belt in the world: + the solid's, − the points'
 

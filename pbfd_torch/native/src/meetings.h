@@ -97,9 +97,10 @@ template <class V, class N, int D> struct Meetings {
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
       each_spot(r, [&](Spot<V>& s, int held) {
-        V c[3], push, rises;
+        V c[3], push, rises, firmness = V(slots.laws(r)[0]);
         Beside<V, 3> solid;
-        release_law(V(slots.laws(r)[0]), depth(pair, r, s, at, c, solid), s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        if constexpr (decltype(pair)::Support::wanders) firmness = firmness * s.share;
+        release_law(firmness, depth(pair, r, s, at, c, solid), s.began, per_dt * V(slots.laws(r)[3]), push, rises);
         visit(held, push);
       });
     });
@@ -164,7 +165,11 @@ template <class V, class N, int D> struct Meetings {
     Pair::Surface::beside(s, slots.solid(r), own, solid);
     for (int j = 0; j < 3; j++) n[j] = solid.normal[j];
     times(slots.rotation(at, bodies.second[r]), n, solid.normal);
-    return select(s.there > V(0), V(slots.radius(r)) - solid.distance, V(-NOWHERE));
+    V depth = V(slots.radius(r)) - solid.distance;
+    if constexpr (Pair::Support::wanders)
+      depth = sunk<typename Pair::Support>(
+          s, slots.curved(r), slots.standing(at, bodies.first[r]), slots.standing(at, bodies.second[r]), c, solid);
+    return select(s.there > V(0), depth, V(-NOWHERE));
   }
 
   // The rest of what is to be known of a candidate whose centre and depth are.
@@ -176,7 +181,7 @@ template <class V, class N, int D> struct Meetings {
     times(R, start, carried);
     for (int j = 0; j < 3; j++) t.moved[j] = t.center[j] - (carried[j] + p[j]);
     t.start = s.began;
-    if constexpr (!Surface::flat) {
+    if constexpr (!Surface::flat && !Pair::Support::leans) {
       Beside<V, 3> seen = t.solid;
       V own[3], bend[9], half[9];
       slots.seen(r, now, t.center, own), transposed_times(R, t.solid.normal, seen.normal);
@@ -184,7 +189,12 @@ template <class V, class N, int D> struct Meetings {
       product(R, bend, half), product_transposed(half, R, t.bend);
     }
     if constexpr (Pair::Support::rolls) {
-      Ball::arm<Surface::flat>(V(slots.radius(r)), t.solid.normal, t.bend, t.arm);
+      if constexpr (Pair::Support::wanders)
+        reach_out<typename Pair::Support>(
+            s, slots.curved(r), slots.standing(now, bodies.first[r]), slots.standing(now, bodies.second[r]), t.center, t.solid,
+            t.bend, t.arm);
+      else
+        Ball::arm<Surface::flat>(V(slots.radius(r)), t.solid.normal, t.bend, t.arm);
       if (!turned[r]) turn(r);
       t.turn = turned_by + 3 * r, t.rolling = rollings + 9 * r;
     } else {
@@ -193,6 +203,14 @@ template <class V, class N, int D> struct Meetings {
     const N* law = slots.laws(r);
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
     t.per_range = per_dt * V(law[3]), t.per_width = (anchored(r) ? V(1) : per_dt) * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
+    if constexpr (Pair::Support::wanders) t.firmness = t.firmness * s.share;
+  }
+  // s alone.
+  template <class Pair> void arm(Pair, int r, const Spot<V>& s, const Beside<V, 3>& solid, V* out) const {
+    if constexpr (Pair::Support::wanders)
+      arm_of(s, slots.curved(r), slots.standing(now, bodies.first[r]), solid, out);
+    else
+      for (int j = 0; j < 3; j++) out[j] = V(-slots.radius(r)) * solid.normal[j];
   }
 
  private:

@@ -129,15 +129,15 @@ template <class V, class N, int D = 3> struct Outlook {
       v[j] -= v_other[j], a[j] -= a_other[j];
     }
     add_cross(w, v, a);  // Coriolis: seen from a turning body
-    for (int j = 0; j < 3; j++) v_other[j] = V(-meetings.slots.radius(r)) * n[j];
+    meetings.arm(pair, r, spot, at.solid, v_other);
     add_cross(spin, v_other, v);
     const V sinks = -dot(v, n), faster = -dot(a, n);
     if (!any(((at.depth + at.solid.steepness * (max(sinks, zero) + V(0.5) * max(faster, zero)) > zero) | (at.holding > zero)) & where) &&
-        Pair::Surface::flat)
+        (Pair::Surface::flat || Pair::Support::leans))
       return;
     meetings.touch(pair, r, spot, at);
     V deepens = faster;
-    if constexpr (!Pair::Surface::flat) {
+    if constexpr (!Pair::Surface::flat && !Pair::Support::leans) {
       V tilt[3];
       times(at.bend, v, tilt);
       deepens -= dot(tilt, v);

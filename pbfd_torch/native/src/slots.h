@@ -2,7 +2,7 @@
 // same rows for all.
 #pragma once
 #include "branches.h"
-#include "facets.h"
+#include "curved.h"
 #include "finder.h"
 
 namespace pbfd {
@@ -75,8 +75,10 @@ template <class V, class N, int D> struct Slots {
     for (int j = 0; j < 3; j++) out[j] += position(at, bodies.first[row])[j];
   }
   const T* solid(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 1; }
-  const T* own_frames(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 17; }
+  const T* own_frames(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + OWN_FRAMES; }
   T radius(int row) const { return bodies.of_row[NUMBERS_OF_A_ROW * row]; }
+  Curved<T> curved(int row) const { return {bodies.of_row + NUMBERS_OF_A_ROW * row}; }
+  Standing<V> standing(Poses<V> at, int node) const { return {rotation(at, node), position(at, node)}; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
 
   // Where a candidate of a group is in a lane.
@@ -96,6 +98,8 @@ template <class V, class N, int D> struct Slots {
         case BALL_ON_PILL: visit(Pair<Guarded<Pill>, Ball>(), r); break;
         case BALL_ON_BLOCK: visit(Pair<Guarded<Block>, Ball>(), r); break;
         case BALL_ON_DRUM: visit(Pair<Guarded<Drum>, Ball>(), r); break;
+        case RIM_ON_FACE: visit(Pair<Face, Ellipsoid>(), r); break;
+        case ROUND_ON_ROUND: visit(Pair<Near, Approaching>(), r); break;
       }
     }
   }
@@ -175,6 +179,11 @@ template <class V, class N, int D> struct Slots {
     if (place >= most[c.row]) s.clear(), most[c.row] = place + 1;  // no lane has had it
     put(s.there, i, T(1)), put(s.offset, i, c.offset), put(s.passed, i, T(c.passed)), put(s.near, i, T(c.near));
     for (int j = 0; j < 3; j++) put(s.position[j], i, c.position[j]), put(s.normal[j], i, c.normal[j]);
+    if (bodies.meeting[c.row] >= CURVED) {
+      put(s.rim, i, T(c.rim)), put(s.lying, i, T(c.lying)), put(s.follows, i, T(c.follows));
+      for (int j = 0; j < 2; j++) put(s.swept[j], i, T(c.swept[j]));
+      for (int j = 0; j < 3; j++) put(s.other[j], i, c.other[j]);
+    }
     return at;
   }
 
@@ -201,8 +210,20 @@ template <class V, class N, int D> struct Slots {
     center(row, s, before, c), seen(row, before, c, s.start);
     for (int j = 0; j < 3; j++) belt[j] = V(laws(row)[5 + j]);
     transposed_times(rotation(before, bodies.second[row]), belt, ran);
-    s.began = depth(row, s, s.start);
+    s.began = bodies.meeting[row] < CURVED ? depth(row, s, s.start) : curved_depth(row, s, c);
     for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);
+  }
+
+  // Of a curved body, and which part of its normal force it gives in this step.
+  V curved_depth(int row, Spot<V>& s, const V* c) const {
+    const Standing<V> one = standing(before, bodies.first[row]), other = standing(before, bodies.second[row]);
+    Beside<V, 3> plane;
+    V axis[3];
+    Face::beside(s, solid(row), s.start, plane);
+    times(other.rotation, s.normal, plane.normal), times(one.rotation, curved(row).axis(), axis);
+    s.share = Ellipsoid::share(s.lying, dot(axis, plane.normal));
+    return bodies.meeting[row] == ROUND_ON_ROUND ? sunk<Approaching>(s, curved(row), one, other, c, plane)
+                                                 : sunk<Ellipsoid>(s, curved(row), one, other, c, plane);
   }
 
   // At a point as the solid's body sees it.

@@ -100,7 +100,7 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
     V carried[D * T];  // a material point at p would move by ω × s
     arms<D>(s, carried);
     for (int b = 0; b < T; b++) {  // ω
-      V column[T], slips[D], a[D], wandered[D], sinks = zero;
+      V column[T], slips[D], a[D], wandered[D], tilt[D], sinks = zero;
       for (int j = 0; j < T; j++) column[j] = t.rolling[T * j + b];
       for (int j = 0; j < D; j++) wandered[j] = -carried[T * j + b];
       swing<D>(column, s, slips);
@@ -110,9 +110,15 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
         add_swing<D>(t.turn, shifted, slips);
         sinks = -t.arm.reach_by_turn[b];
       }
-      const V along = dot<D>(n, slips);
-      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], slips[j]);
+      V along = dot<D>(n, slips);
+      if constexpr (Support::leans) {
+        for (int j = 0; j < D; j++) tilt[j] = t.arm.tilt[T * j + b];
+        along += dot<D>(m, tilt);
+      }
+      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], Support::leans ? fma(-lifted, tilt[j], slips[j]) : slips[j]);
       answer(slips, sinks, a);
+      if constexpr (Support::leans)
+        for (int j = 0; j < D; j++) a[j] = fma(-push, tilt[j], a[j]);
       wrench(b, T, a, wandered, by_turn);
     }
   }
