@@ -132,7 +132,7 @@ def test_friction_of_each_world() -> None:
 @pytest.mark.parametrize(
     ("law", "solid", "restitution", "words"),
     [
-        (NormalForce(1e5, exponent=1.5), GROUND, None, "normal force on 'ground' with another exponent than 2"),
+        (NormalForce(1e5).seen_from(1e-3), GROUND, None, "normal force on 'ground', a DistantForce"),
         (NormalForce(1e5), HalfSpace(motion=Conveyor((1.0, 0.0, 0.0))), None, "contact with 'ground', which moves"),
         (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), None, "contact with 'hull', which is a ConvexSurface"),
         (NormalForce(1e5), GROUND, Restitution(0.5), "restitution"),

@@ -7,11 +7,13 @@
 namespace pbfd {
 
 template <class V, class N, int D> struct Contacts {
+  using Scalar = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
   const V* grip = nullptr;  // μ [candidates] of the worlds in the lanes
   const Relaxed<V>& relaxed;
+  const Laws<V, N, D>& laws;
   // what is fixed in a step
   const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
   Poses<V> before;  // of the nodes at its start
@@ -26,8 +28,8 @@ template <class V, class N, int D> struct Contacts {
   static int room(Sizes s) {
     return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
-      : plan(scene), candidates(scene.contact), relaxed(easier) {
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Arena<V>& arena)
+      : plan(scene), candidates(scene.contact), relaxed(easier), laws(all) {
     share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
@@ -107,7 +109,8 @@ template <class V, class N, int D> struct Contacts {
     return traced < V(D - 2);
   }
 
-  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  // What the normal forces of the step's own problem are where nodes are at these poses, and what lagged friction feels there:
+  // visit(candidate, force, felt).
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     each_kind(candidates, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) {
@@ -118,8 +121,10 @@ template <class V, class N, int D> struct Contacts {
         center(i, at, c);
         V firmness = V(candidates.firmness[i]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
-        release_law(firmness, depth(pair, i, at, c, solid), start, per_dt * V(candidates.per_release[i]), push, rises);
-        visit(i, push);
+        const Law<V>* law = laws.at(candidates.law[i]);
+        const V d = depth(pair, i, at, c, solid);
+        normal_force(law, firmness, d, start, per_dt * V(candidates.per_release[i]), push, rises);
+        visit(i, push, law ? law->feels(push, d) : push);
       }
     });
   }
@@ -146,7 +151,7 @@ template <class V, class N, int D> struct Contacts {
     return reach + V(candidates.margin[i]) - solid.distance;
   }
 
-  // What its normal force stores where the nodes are: C d³/3 (Eq. 9), of the solid itself.
+  // What its normal force stores where the nodes are: C d^(α+1)/(α+1) (Eq. 9), of the solid itself.
   template <class Pair> V stored(Pair, int i) const {
     V c[D], firmness = V(candidates.firmness[i]);
     Beside<V, D> solid;
@@ -155,6 +160,8 @@ template <class V, class N, int D> struct Contacts {
     if constexpr (Pair::Support::wanders)
       firmness = firmness * Pair::Support::share(candidates, i, now.rotation + D * D * candidates.carrier[i], solid.normal);
     const V d = max(sunk(Pair(), i, now, solid), V(0));
+    const Law<V>* law = laws.at(candidates.law[i]);
+    if (!squared(law)) return firmness * power(d, law->exponent + Scalar(1)) / V(law->exponent + Scalar(1));
     return V(1) / V(3) * firmness * d * d * d;
   }
 
@@ -179,7 +186,7 @@ template <class V, class N, int D> struct Contacts {
     t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
     t.per_range = per_dt * V(candidates.per_release[i]);
     t.per_width = (anchored(i) ? V(1) : per_dt) * V(candidates.per_width[i]) / relaxed.width;
-    t.relaxed = &relaxed;
+    t.relaxed = &relaxed, t.law = laws.at(candidates.law[i]);
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
     if (!turned[k]) turn(k);

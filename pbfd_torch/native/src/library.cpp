@@ -11,7 +11,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 8; }
+int pbfd_interface() { return 9; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -20,7 +20,7 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
+  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
   return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
           {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots}};
 }

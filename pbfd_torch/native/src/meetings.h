@@ -25,6 +25,7 @@ template <class V, class N, int D> struct Meetings {
   const Plan<N, D>& plan;
   const Bodies<T>& bodies;
   const Relaxed<V>& relaxed;
+  const Laws<V, N, D>& laws;
   Slots<V, N, D> slots;
   V per_dt;
   // of the nodes at a configuration
@@ -37,8 +38,8 @@ template <class V, class N, int D> struct Meetings {
     const int rows = D == 3 ? s.bodies.rows : 0;
     return Slots<V, N, D>::room(s) + Slots<V, N, D>::in(int(sizeof(Push<V, 3>)) * rows) + 12 * rows + Slots<V, N, D>::in(rows);
   }
-  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
-      : plan(scene), bodies(scene.pairing), relaxed(easier), slots(scene, arena) {
+  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Arena<V>& arena)
+      : plan(scene), bodies(scene.pairing), relaxed(easier), laws(all), slots(scene, arena) {
     const int rows = D == 3 ? bodies.rows : 0;
     sums = reinterpret_cast<Push<V, 3>*>(arena.take(slots.in(int(sizeof(Push<V, 3>)) * rows)));
     turned_by = arena.take(3 * rows), rollings = arena.take(9 * rows);
@@ -93,14 +94,16 @@ template <class V, class N, int D> struct Meetings {
       }
   }
 
-  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  // See `Contacts`.
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
       each_spot(r, [&](Spot<V>& s, int held) {
         V c[3], push, rises;
         Beside<V, 3> solid;
-        release_law(V(slots.laws(r)[0]), depth(pair, r, s, at, c, solid), s.began, per_dt * V(slots.laws(r)[3]), push, rises);
-        visit(held, push);
+        const Law<V>* law = laws.at(bodies.law[r]);
+        const V d = depth(pair, r, s, at, c, solid);
+        normal_force(law, V(slots.laws(r)[0]), d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        visit(held, push, law ? law->feels(push, d) : push);
       });
     });
   }
@@ -175,7 +178,8 @@ template <class V, class N, int D> struct Meetings {
     }
     const N* law = slots.laws(r);
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
-    t.per_range = per_dt * V(law[3]), t.per_width = per_dt * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
+    t.per_range = per_dt * V(law[3]), t.per_width = per_dt * V(law[4]) / relaxed.width;
+    t.relaxed = &relaxed, t.law = laws.at(bodies.law[r]);
   }
 
  private:

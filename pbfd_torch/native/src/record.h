@@ -67,8 +67,8 @@ template <class V, class N, class Scheme> struct Recorder {
       count = last - at < W ? last - at : W;
       for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));
       place(plan, after.q, balance.now, balance.axes);
-      balance.contacts.look(balance.now), balance.meetings.look(balance.now);
-      write_state();
+      balance.contacts.look(balance.now);
+      balance.laws.begin(balance.dt), write_state();
       if (record->suspect) write_step();
     }
   }
@@ -184,6 +184,7 @@ template <class V, class N, class Scheme> struct Recorder {
     scheme.begin(balance, before, guess, M(false));
     contacts.begin(balance.start, balance.target, balance.dt);
     balance.meetings.begin(M(true), balance.start, balance.target, balance.dt, true);
+    balance.meetings.look(balance.now);  // at the rows that have just been found
     V worst = listed(roster.still_strain()), number = listed(roster.still_suspect());
     auto strained = [&](V share, int danger) {  // of those strained alike, the first
       const V this_one = V(T(danger));
