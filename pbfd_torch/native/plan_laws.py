@@ -26,7 +26,8 @@ USUAL = -1  # the law C d² with Coulomb's friction, of which most contacts are:
 
 @dataclass
 class Laws:
-    """The other ones, of a candidate or of a pair each: its manner, and α, e, γ, μ_s − μ_k, 1/v_s [s/m], `[*, 1]` each."""
+    """The other ones, of a candidate or of a pair each: its manner, and α, e, γ, μ_s − μ_k, 1/v_s [s/m], the restitution (0: none)
+    and its threshold [m/s], `[*, 1]` each."""
 
     manners: list[int] = field(default_factory=list)
     rows: list[Sequence[Tensor]] = field(default_factory=list)
@@ -63,11 +64,9 @@ class Law:
     @classmethod
     def of(cls, a: Articulation, term: ContactLaws[Any], name: str, count: int) -> Law:
         """Of a term. Raises `NotCompiledError` for laws that the core does not know."""
-        law, firm = term.normal_force, term.firm
+        law, firm, back = term.normal_force, term.firm, term.restitution
         if type(law) is not NormalForce:
             raise unknown(f"normal force on {name}, a {type(law).__name__}")
-        if term.restitution is not None:
-            raise unknown("restitution")
 
         def each(value: float | Tensor | None, other: float = 0.0) -> Tensor:
             number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
@@ -89,8 +88,11 @@ class Law:
             each(friction.sunk),
             each(friction.excess) * grip,
             each(friction.per_fall),
+            each(0.0 if back is None else back.coefficient),
+            each(0.0 if back is None else back.threshold),
         )
-        return cls(friction.manner, particulars, friction.manner == COULOMB and law.exponent == 2.0, numbers)
+        usual = friction.manner == COULOMB and law.exponent == 2.0 and back is None
+        return cls(friction.manner, particulars, usual, numbers)
 
 
 @dataclass(frozen=True, eq=False)

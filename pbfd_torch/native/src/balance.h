@@ -73,8 +73,8 @@ template <class V, class N, int D = 3> struct Balance {
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
-    laws.begin(dt);
-    contacts.begin(start, target, dt);
+    laws.begin(dt), laws.coast(target, dt);
+    contacts.begin(anew, start, target, dt);
     meetings.begin(anew, start, target, dt, sorted);
     if (meetings.slots.changed) part(), meetings.slots.changed = false;
   }

@@ -12,9 +12,10 @@ template <class V> struct Spot {
   V passed, near;         // 1 or 0, see finder.h
   V slot;                 // its place among the candidates of its lane
   V start[3], began;      // where the solid's body sees the point at the start, less what its belt runs; and how deep it is there
+  V bounce;               // how far the solid is moved out for the step to throw the point back
 
   void clear() {
-    there = slot = offset = passed = near = began = V(0);
+    there = slot = offset = passed = near = began = bounce = V(0);
     for (int j = 0; j < 3; j++) position[j] = normal[j] = start[j] = V(0);
   }
 };

@@ -5,6 +5,7 @@
 #include "powers.h"
 #include "relaxed.h"
 #include "release.h"
+#include "tree.h"
 
 namespace pbfd {
 
@@ -17,12 +18,30 @@ template <class V> struct Grasp {
   V drag, by_depth, by_size, lift, lift_by_depth, lift_by_size;
 };
 
+constexpr double HARDER = 300;  // times less deep a contact gets that throws back
+
 // One of them as a step has it.
 template <class V> struct Law {
   using T = typename Kind<V>::Scalar;
   int manner;
   T exponent, slip, sunk;  // α; e and γ of G = μ yᵉ d^(γ+1)
   V excess, per_fall;      // μ_s − μ_k, and 1 / (v_s Δt)
+  T restitution, threshold;
+
+  bool throws() const { return restitution > T(0); }
+  // How far the solid is moved out for a step Δt, by the gaps at its start and at the ends of its free motion and of that without
+  // gravity; 0 where nothing bounces (terms/restitution.py).
+  [[gnu::noinline]] V bounce(V gap, V free, V coasting, V dt) const {
+    const V zero(0), square(restitution * restitution), closing = gap - coasting, pull = max(coasting - free, zero);
+    const V left = square * closing * (closing + pull) - V(2) * (V(1) - square) * pull * gap;
+    const auto bounces = (gap >= zero) & (free < zero) & (closing > V(threshold) * dt) & (left > zero);
+    const V root = sqrt(pull * pull + V(4) * select(bounces, left, V(1)));
+    return select(bounces, gap + V(0.5) * (root - pull), zero);
+  }
+  // What gives way is lost to the rebound.
+  V harder(V stiffness, V bounce) const {
+    return stiffness * select(bounce > V(0), V(power(T(HARDER), exponent)), V(1));
+  }
 
   // N and dN/dd, as `release_law` with α for 2.
   [[gnu::noinline]] void press(V stiffness, V depth, V start, V per_range, V& push, V& slope) const {
@@ -89,20 +108,32 @@ template <class V, class N, int D> struct Laws {
   const Plan<N, D>& plan;
   const Relaxed<V>& relaxed;
   Law<V>* law;  // [uncommon]
+  bool throwing = false;  // some of them
+  Poses<V> coasting;      // where the nodes would end the step without gravity
 
-  static int room(Sizes s) { return int((s.uncommon * sizeof(Law<V>) + sizeof(V) - 1) / sizeof(V)); }
+  static int listed(Sizes s) { return int((s.uncommon * sizeof(Law<V>) + sizeof(V) - 1) / sizeof(V)); }
+  static int room(Sizes s) { return s.uncommon > 0 ? listed(s) + D * s.nodes : 0; }
   Laws(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena) : plan(scene), relaxed(easier) {
-    law = reinterpret_cast<Law<V>*>(arena.take(room(plan)));
+    law = reinterpret_cast<Law<V>*>(arena.take(listed(plan)));
+    if (plan.uncommon > 0) coasting.position = arena.take(D * plan.nodes);
   }
 
   // A step begins.
   void begin(V dt) {
+    throwing = false;
     const N* x = plan.particulars;
     for (int j = 0; j < plan.uncommon; j++, x += PARTICULARS) {
       Law<V>& l = law[j];
       l.manner = plan.manner[j], l.exponent = lane(x[0], 0), l.slip = lane(x[1], 0), l.sunk = lane(x[2], 0);
       l.excess = V(x[3]), l.per_fall = V(x[4]) / (dt * relaxed.width);
+      l.restitution = lane(x[5], 0), l.threshold = lane(x[6], 0), throwing = throwing || l.throws();
     }
+  }
+  // It would lead to `free` without contacts.
+  void coast(Poses<V> free, V dt) {
+    if (!throwing) return;
+    coasting.rotation = free.rotation;
+    for (int i = 0; i < D * plan.nodes; i++) coasting.position[i] = fma(-(dt * dt), V(plan.gravity[i % D]), free.position[i]);
   }
 
   // That of a number, if it has one.

@@ -53,7 +53,26 @@ template <class V, class N, int D> struct Meetings {
   void begin(M which, Poses<V> start, Poses<V> free, V dt, bool sorted) {
     per_dt = V(1) / dt;
     if constexpr (D == 3)
-      if (bodies.rows > 0) slots.find(which, start, free, dt, sorted);
+      if (bodies.rows > 0) {
+        slots.find(which, start, free, dt, sorted);
+        if (laws.throwing) throw_back(which, free, dt);
+      }
+  }
+  [[gnu::noinline]] void throw_back(M which, Poses<V> free, V dt) {
+    for (int k = 0; k < slots.active; k++) {
+      const int r = slots.rows[k];
+      const Law<V>* law = laws.at(bodies.law[r]);
+      if (!law || !law->throws()) continue;
+      each_spot(r, [&](Spot<V>& s, int) {
+        auto gap = [&](Poses<V> at) {
+          V c[3], own[3];
+          slots.center(r, s, at, c), slots.seen(r, at, c, own);
+          return -slots.depth(r, s, own);
+        };
+        const V found = law->bounce(-s.began, gap(free), gap(laws.coasting), dt);
+        s.bounce = select(which, select(s.there > V(0), found, V(0)), s.bounce);
+      });
+    }
   }
 
   // The nodes are at these poses.
@@ -69,7 +88,7 @@ template <class V, class N, int D> struct Meetings {
       sums[r].any = false;
       each_spot(r, [&](Spot<V>& s, int held) {
         Touching<V, 3> t;
-        t.depth = depth(pair, r, s, now, t.center, t.solid), t.holding = relaxed.holding(held);
+        t.depth = depth(pair, r, s, now, t.center, t.solid) + s.bounce, t.holding = holding(s, held);
         if (!any((t.depth > V(0)) | (t.holding > V(0)))) return;
         touch(pair, r, s, t);
         pbfd::press<Pair::Surface::flat, typename Pair::Support>(t, sums[r]);
@@ -101,8 +120,8 @@ template <class V, class N, int D> struct Meetings {
         V c[3], push, rises;
         Beside<V, 3> solid;
         const Law<V>* law = laws.at(bodies.law[r]);
-        const V d = depth(pair, r, s, at, c, solid);
-        normal_force(law, V(slots.laws(r)[0]), d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        const V d = depth(pair, r, s, at, c, solid) + s.bounce, firmness = V(slots.laws(r)[0]);
+        normal_force(law, law ? law->harder(firmness, s.bounce) : firmness, d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
         visit(held, push, law ? law->feels(push, d) : push);
       });
     });
@@ -139,6 +158,9 @@ template <class V, class N, int D> struct Meetings {
     }
     return found;
   }
+
+  // What lagged friction feels; a lane without this candidate has never been asked.
+  V holding(const Spot<V>& s, int held) const { return select(s.there > V(0), relaxed.holding(held), V(0)); }
 
   // visit(spot, its number among all candidates)
   template <class F> void each_spot(int r, F&& visit) const {
@@ -180,6 +202,7 @@ template <class V, class N, int D> struct Meetings {
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
     t.per_range = per_dt * V(law[3]), t.per_width = per_dt * V(law[4]) / relaxed.width;
     t.relaxed = &relaxed, t.law = laws.at(bodies.law[r]);
+    if (t.law) t.firmness = t.law->harder(t.firmness, s.bounce);
   }
 
  private:

@@ -89,6 +89,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const V *c = at.center, *n = at.solid.normal;
     contacts.center(i, contacts.now, at.center);
     at.depth = contacts.depth(pair, i, contacts.now, c, at.solid);
+    if (contacts.laws.throwing) at.depth += contacts.moved_out(i);
     V v[D], a[D];
     move(k, c, v, a);
     if constexpr (!simple) {
@@ -121,7 +122,8 @@ template <class V, class N, int D = 3> struct Outlook {
   void foresee(Meetings<V, N, D>& meetings, Pair pair, int r, const Spot<V>& spot, int held, typename Kind<V>::Mask where) {
     const V zero(0);
     Touching<V, 3> at;
-    at.depth = meetings.depth(pair, r, spot, meetings.now, at.center, at.solid), at.holding = relaxed->holding(held);
+    at.depth = meetings.depth(pair, r, spot, meetings.now, at.center, at.solid) + spot.bounce;
+    at.holding = meetings.holding(spot, held);
     V v[3], a[3], v_other[3], a_other[3], w[3], spin[3];
     const V *c = at.center, *n = at.solid.normal;
     move(meetings.bodies.first[r], c, v, a), move(meetings.bodies.second[r], c, v_other, a_other);

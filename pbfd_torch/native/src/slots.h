@@ -77,6 +77,18 @@ template <class V, class N, int D> struct Slots {
   T radius(int row) const { return bodies.of_row[NUMBERS_OF_A_ROW * row]; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
 
+  // How deep a candidate is at a point as the solid's body sees it.
+  V depth(int row, const Spot<V>& s, const V* own) const {
+    Beside<V, 3> beside;
+    switch (bodies.meeting[row]) {
+      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
+      default: Face::beside(s, solid(row), own, beside);
+    }
+    return V(radius(row)) - beside.distance;
+  }
+
   // Where a candidate of a group is in a lane.
   int* slot(int group, int i, int which) const {
     int first = 0;
@@ -178,18 +190,6 @@ template <class V, class N, int D> struct Slots {
     transposed_times(rotation(before, bodies.second[row]), belt, ran);
     s.began = depth(row, s, s.start);
     for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);
-  }
-
-  // At a point as the solid's body sees it.
-  V depth(int row, const Spot<V>& s, const V* own) const {
-    Beside<V, 3> beside;
-    switch (bodies.meeting[row]) {
-      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
-      default: Face::beside(s, solid(row), own, beside);
-    }
-    return V(radius(row)) - beside.distance;
   }
 };
 
