@@ -30,7 +30,6 @@ from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
 from tests.native_parity import DT, gaps, require_balance, require_starts, require_steps, resting
@@ -130,17 +129,16 @@ def test_friction_of_each_world() -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "solid", "restitution", "words"),
+    ("law", "solid", "words"),
     [
-        (NormalForce(1e5, exponent=1.5), GROUND, None, "normal force on 'ground' with another exponent than 2"),
-        (NormalForce(1e5), HalfSpace(motion=Conveyor((1.0, 0.0, 0.0))), None, "contact with 'ground', which moves"),
-        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), None, "contact with 'hull', which is a ConvexSurface"),
-        (NormalForce(1e5), GROUND, Restitution(0.5), "restitution"),
+        (NormalForce(1e5).seen_from(1e-3), GROUND, "normal force on 'ground', a DistantForce"),
+        (NormalForce(1e5), HalfSpace(motion=Conveyor((1.0, 0.0, 0.0))), "contact with 'ground', which moves"),
+        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), "contact with 'hull', which is a ConvexSurface"),
     ],
 )
-def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, restitution: Restitution | None, words: str) -> None:
+def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, words: str) -> None:
     a = two_links()
-    contact = Contact.between(a, [Collider("c", "second", Sphere(0.1))], solid, law, CoulombFriction(0.7), restitution)
+    contact = Contact.between(a, [Collider("c", "second", Sphere(0.1))], solid, law, CoulombFriction(0.7))
     scene = Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
     assert uncovered(Simulator(scene, DT).eager) == f"the core does not know {words}"
 

@@ -24,7 +24,7 @@ class _Plan(ctypes.Structure):
             (name, ctypes.c_int)
             for name in (
                 *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
-                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes", "varied"),
+                *("candidates", "anchors", "planes", "solids", "samples", "forms", "uncommon", "pushes", "varied"),
             )
         ),
         *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),

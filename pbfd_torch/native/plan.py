@@ -114,7 +114,8 @@ class _Parts:
     def real(self) -> list[Tensor]:
         """All numbers."""
         nodes = (x.flatten(-rank) for x, rank in zip(self.nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True))
-        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes, *self.bodies.laws]
+        laws = [*self.bodies.laws, *self.candidates.laws.real()]
+        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes, *laws]
 
     @property
     def apart(self) -> bool:
@@ -133,7 +134,7 @@ class _Parts:
         sizes = zip(t.joint_sizes, t.joint_is_hinge, strict=True)
         kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in sizes]
         whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
-        whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed
+        whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed + candidates.laws.manners
         real, which, own = _told_apart(self.real)
         return Plan(
             sizes=(t.njoint, t.nq, t.nv, len(self.driven) // 2, self.halvings, *candidates.sizes, len(self.pushed)),
@@ -169,7 +170,7 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
-        bodies=(bodies := Bodies.of(a, known.meetings, 3 * sum(known.candidates.anchors))),
+        bodies=(bodies := Bodies.of(a, known.meetings, known.candidates.laws, 3 * sum(known.candidates.anchors))),
         driven=driven,
         pushed=known.pushed,
         halvings=len(shares) - 1,

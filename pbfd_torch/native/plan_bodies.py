@@ -18,9 +18,10 @@ from pbfd_torch.contact.polytope import Polytope
 from pbfd_torch.contact.polytope_pairs import PolytopePairs
 from pbfd_torch.contact.round_pairs import RoundPairs
 from pbfd_torch.native.not_compiled import unknown
-from pbfd_torch.native.plan_contact import along, laws_of
+from pbfd_torch.native.plan_contact import along
 from pbfd_torch.native.plan_curved import round_pair, round_table, row_of, shape_row
 from pbfd_torch.native.plan_hulls import hulls
+from pbfd_torch.native.plan_laws import Law, Laws
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.tree.articulation import Articulation, homogeneous
@@ -38,7 +39,8 @@ class Bodies:
     Attributes:
         frames: of the bodies [4, 4] on their nodes, obstacles after all links; nodes: −1: the world. links: how many of them are.
         kept, finders, ends: of each term how many candidates it keeps, what finds them, and how many pairs there are up to it.
-        rows: of each its nodes, what meets what, its term and the place of its pair; sizes: its numbers, `[49]`; laws: `[*, 8]`.
+        rows: of each its nodes, what meets what, its term, the place of its pair and its law (`Laws`); sizes: its numbers, `[49]`;
+            laws: `[*, 8]`.
         pairs: of each its first row, its colliders, whether these are boxes, and its links; numbers: `[14]`.
         colliders: node and link of each; places: its frame there, `[12]`; polytopes.
         extents, slack: of each term. memory: where what its anchors remember begins, −1: it has none; remembered: how much in all.
@@ -50,7 +52,7 @@ class Bodies:
     kept: list[int] = field(default_factory=list)
     finders: list[int] = field(default_factory=list)
     ends: list[int] = field(default_factory=lambda: [0])
-    rows: list[tuple[int, int, int, int, int]] = field(default_factory=list)
+    rows: list[tuple[int, int, int, int, int, int]] = field(default_factory=list)
     sizes: list[Tensor] = field(default_factory=list)
     laws: list[Tensor] = field(default_factory=list)
     pairs: list[tuple[int, int, int, int, int, int]] = field(default_factory=list)
@@ -64,8 +66,9 @@ class Bodies:
     remembered: int = 0
 
     @classmethod
-    def of(cls, a: Articulation, terms: Sequence[BodyContact], before: int) -> Bodies:
-        """Of the terms of a scene, where other contacts remember so many numbers `before` these. Raises `NotCompiledError`."""
+    def of(cls, a: Articulation, terms: Sequence[BodyContact], laws: Laws, before: int) -> Bodies:
+        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws. Raises
+        `NotCompiledError`."""
         frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
         obstacles = list(terms[0].obstacles) if terms else []
         for x in obstacles:
@@ -76,7 +79,7 @@ class Bodies:
             raise unknown("contact between bodies whose frames differ from world to world")
         bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *(-1 for _ in starts)], len(nodes))
         for term in terms:
-            bodies._take(a, term, before)
+            bodies._take(a, term, laws, before)
         return bodies
 
     @property
@@ -112,18 +115,18 @@ class Bodies:
     def _hulls(self) -> tuple[list[int], Tensor]:
         return hulls(self.polytopes)
 
-    def _take(self, a: Articulation, term: BodyContact, before: int) -> None:
+    def _take(self, a: Articulation, term: BodyContact, laws: Laws, before: int) -> None:
         """Adds a term."""
         if term.overflow is not Overflow.FLAG:
             raise unknown(f"overflow {term.overflow.name} of contact between bodies")
-        laws = laws_of(a, term, "bodies", len(term.pairs))
+        law = Law.of(a, term, "bodies", len(term.pairs))
         group = len(self.kept)
         for first, second, kind, size, place in self._rows(term.finder):
-            self.rows.append((self.nodes[first], self.nodes[second], kind, group, place))
+            self.rows.append((self.nodes[first], self.nodes[second], kind, group, place, laws.number(law, place)))
             frames = (_flat(self.frames[first]), _flat(self.frames[second]))
             self.sizes.append(torch.cat((torch.nn.functional.pad(size, (0, OWN_FRAMES - len(size))), *frames)))
             belt = self._belt(term, second) - self._belt(term, first)
-            some = [x[..., place, None] for x in laws]
+            some = [x[..., place, None] for x in law.numbers]
             batch = torch.broadcast_shapes(*(x.shape[:-1] for x in some))
             self.laws.append(torch.cat([x.expand(*batch, x.shape[-1]) for x in (*some, belt)], -1))
         self.kept.append(term.finder.slots)

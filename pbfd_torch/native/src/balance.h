@@ -30,13 +30,15 @@ template <class V, class N, int D = 3> struct Balance {
   V *axes, *chord_axes, *chord, *residual, *slopes, *matrix;
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
+  Laws<V, N, D> laws;
   Contacts<V, N, D> contacts;
   Meetings<V, N, D> meetings;
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
+           in_registers<Push<V, D>>(s.nodes) + Laws<V, N, D>::room(s) + Contacts<V, N, D>::room(s) +
+           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
            (3 * S + 4 + s.nv) * s.nv + held(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
@@ -44,7 +46,8 @@ template <class V, class N, int D = 3> struct Balance {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
   }
 
-  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, relaxed, arena), meetings(scene, relaxed, arena) {
+  Balance(const Plan<N, D>& scene, Arena<V>& arena)
+      : plan(scene), laws(scene, relaxed, arena), contacts(scene, relaxed, laws, arena), meetings(scene, relaxed, laws, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
@@ -70,7 +73,8 @@ template <class V, class N, int D = 3> struct Balance {
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
-    contacts.begin(start, target, dt);
+    laws.begin(dt), laws.coast(target, dt);
+    contacts.begin(anew, start, target, dt);
     meetings.begin(anew, start, target, dt, sorted);
     if (meetings.slots.changed) part(), meetings.slots.changed = false;
   }

@@ -38,6 +38,7 @@ template <class T> struct Bodies : BodySizes {
   const int *kept, *finder, *first_pair;  // [groups], [groups], [groups + 1]: how many candidates it keeps, what it is, its pairs
   const int* memory;  // [groups] where what anchors remember of it begins among all that is remembered; −1: it has none
   const int *first, *second, *meeting, *group, *danger;  // [rows]: nodes, what touches what, whose it is, which pair of the term's
+  const int* law;  // [rows], as of candidates.h
   const int *row, *one, *other, *boxes;  // [pairs]: its first row; of polytopes, its colliders and whether both are boxes
   const int* link;  // [2 · pairs] whose colliders these are; −1: of what does not move
   const int *collider_node, *collider_link;  // [colliders]
@@ -50,7 +51,7 @@ template <class T> struct Bodies : BodySizes {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const T* here = reals; reals += count; return here; };
     node = whole(links), kept = whole(groups), finder = whole(groups), first_pair = whole(groups + 1), memory = whole(groups);
-    first = whole(rows), second = whole(rows), meeting = whole(rows), group = whole(rows), danger = whole(rows);
+    first = whole(rows), second = whole(rows), meeting = whole(rows), group = whole(rows), danger = whole(rows), law = whole(rows);
     row = whole(pairs), one = whole(pairs), other = whole(pairs), boxes = whole(pairs), link = whole(2 * pairs);
     collider_node = whole(colliders), collider_link = whole(colliders);
     frame = real(12 * links), extent = real(groups * links), slack = real(groups);

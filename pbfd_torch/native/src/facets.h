@@ -13,12 +13,13 @@ template <class V> struct Spot {
   V slot;                 // its place among the candidates of its lane
   V anchor[3];            // what its anchor is behind by as the solid's node sees it
   V start[3], began;      // where the solid's body sees the point at the start, less what its belt runs; and how deep it is there
+  V bounce;               // how far the solid is moved out for the step to throw the point back
   // of curved bodies, see curved.h
   V rim, lying, share;                    // 1 where it is an ellipsoid's, else 0; see terms/lying.py, and what follows for this step
   V follows, swept[2], other[3];          // 1 or 0; where round bodies come closest, on the node of the other one
 
   void clear() {
-    there = slot = offset = passed = near = began = rim = lying = share = follows = swept[0] = swept[1] = V(0);
+    there = slot = offset = passed = near = began = bounce = rim = lying = share = follows = swept[0] = swept[1] = V(0);
     for (int j = 0; j < 3; j++) position[j] = normal[j] = anchor[j] = start[j] = other[j] = V(0);
   }
 };

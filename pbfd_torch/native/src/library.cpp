@@ -20,7 +20,7 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
+  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
   return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
           {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}};
 }

@@ -165,11 +165,11 @@ template <class V, class N, int D, class Scheme> struct Machine {
     for (int i = 0; i < plan.nq; i++) b.q_target[i] = select(shorter, from[i], b.q_target[i]);
   }
 
-  // Friction is to feel the normal forces where lanes set out from.
+  // Friction is to feel the normal forces, or depths, where lanes set out from.
   void hold(M which) {
     Balance<V, N, D>& b = newton.balance;
     sight.look(from);
-    b.each_normal_force(sight.there, [&](int i, V force) { b.relaxed.held[i] = select(which, force, b.relaxed.held[i]); });
+    b.each_normal_force(sight.there, [&](int i, V, V felt) { b.relaxed.held[i] = select(which, felt, b.relaxed.held[i]); });
   }
 
   // Lanes whose solve has ended take the next detour, or their attempt has ended; who sets out now.

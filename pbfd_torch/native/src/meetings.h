@@ -25,6 +25,7 @@ template <class V, class N, int D> struct Meetings {
   const Plan<N, D>& plan;
   const Bodies<T>& bodies;
   const Relaxed<V>& relaxed;
+  const Laws<V, N, D>& laws;
   Slots<V, N, D> slots;
   V per_dt;
   // of the nodes at a configuration
@@ -37,8 +38,8 @@ template <class V, class N, int D> struct Meetings {
     const int rows = D == 3 ? s.bodies.rows : 0;
     return Slots<V, N, D>::room(s) + Slots<V, N, D>::in(int(sizeof(Push<V, 3>)) * rows) + 12 * rows + Slots<V, N, D>::in(rows);
   }
-  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
-      : plan(scene), bodies(scene.pairing), relaxed(easier), slots(scene, arena) {
+  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Arena<V>& arena)
+      : plan(scene), bodies(scene.pairing), relaxed(easier), laws(all), slots(scene, arena) {
     const int rows = D == 3 ? bodies.rows : 0;
     sums = reinterpret_cast<Push<V, 3>*>(arena.take(slots.in(int(sizeof(Push<V, 3>)) * rows)));
     turned_by = arena.take(3 * rows), rollings = arena.take(9 * rows);
@@ -52,7 +53,25 @@ template <class V, class N, int D> struct Meetings {
   void begin(M which, Poses<V> start, Poses<V> free, V dt, bool sorted) {
     per_dt = V(1) / dt;
     if constexpr (D == 3)
-      if (bodies.rows > 0) slots.find(which, start, free, dt, sorted);
+      if (bodies.rows > 0) {
+        slots.find(which, start, free, dt, sorted);
+        if (laws.throwing) throw_back(which, free, dt);
+      }
+  }
+  [[gnu::noinline]] void throw_back(M which, Poses<V> free, V dt) {
+    if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
+      const Law<V>* law = laws.at(bodies.law[r]);
+      if (!law || !law->throws()) return;
+      each_spot(r, [&](Spot<V>& s, int) {
+        auto gap = [&](Poses<V> at) {
+          V c[3];
+          Beside<V, 3> solid;
+          return -depth(pair, r, s, at, c, solid);
+        };
+        const V found = law->bounce(-s.began, gap(free), gap(laws.coasting), dt);
+        s.bounce = select(which, select(s.there > V(0), found, V(0)), s.bounce);
+      });
+    });
   }
 
   // The nodes are at these poses.
@@ -68,7 +87,7 @@ template <class V, class N, int D> struct Meetings {
       sums[r].any = false;
       each_spot(r, [&](Spot<V>& s, int held) {
         Touching<V, 3> t;
-        t.depth = depth(pair, r, s, now, t.center, t.solid), t.holding = relaxed.holding(held);
+        t.depth = depth(pair, r, s, now, t.center, t.solid) + s.bounce, t.holding = holding(s, held);
         if (!any((t.depth > V(0)) | (t.holding > V(0)))) return;
         touch(pair, r, s, t);
         pbfd::press<Pair::Surface::flat, typename Pair::Support>(t, sums[r]);
@@ -93,15 +112,17 @@ template <class V, class N, int D> struct Meetings {
       }
   }
 
-  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  // See `Contacts`.
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
       each_spot(r, [&](Spot<V>& s, int held) {
         V c[3], push, rises, firmness = V(slots.laws(r)[0]);
         Beside<V, 3> solid;
+        const Law<V>* law = laws.at(bodies.law[r]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * s.share;
-        release_law(firmness, depth(pair, r, s, at, c, solid), s.began, per_dt * V(slots.laws(r)[3]), push, rises);
-        visit(held, push);
+        const V d = depth(pair, r, s, at, c, solid) + s.bounce;
+        normal_force(law, law ? law->harder(firmness, s.bounce) : firmness, d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        visit(held, push, law ? law->feels(push, d) : push);
       });
     });
   }
@@ -154,6 +175,9 @@ template <class V, class N, int D> struct Meetings {
     }
   }
 
+  // What lagged friction feels; a lane without this candidate has never been asked.
+  V holding(const Spot<V>& s, int held) const { return select(s.there > V(0), relaxed.holding(held), V(0)); }
+
   // visit(spot, its number among all candidates)
   template <class F> void each_spot(int r, F&& visit) const {
     for (int j = 0; j < slots.most[r]; j++) visit(slots.spot[SPOTS * r + j], plan.candidates + SPOTS * r + j);
@@ -202,8 +226,10 @@ template <class V, class N, int D> struct Meetings {
     }
     const N* law = slots.laws(r);
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
-    t.per_range = per_dt * V(law[3]), t.per_width = (anchored(r) ? V(1) : per_dt) * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
+    t.per_range = per_dt * V(law[3]), t.per_width = (anchored(r) ? V(1) : per_dt) * V(law[4]) / relaxed.width;
+    t.relaxed = &relaxed, t.law = laws.at(bodies.law[r]);
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * s.share;
+    if (t.law) t.firmness = t.law->harder(t.firmness, s.bounce);
   }
   // s alone.
   template <class Pair> void arm(Pair, int r, const Spot<V>& s, const Beside<V, 3>& solid, V* out) const {

@@ -81,6 +81,18 @@ template <class V, class N, int D> struct Slots {
   Standing<V> standing(Poses<V> at, int node) const { return {rotation(at, node), position(at, node)}; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
 
+  // How deep a candidate is at a point as the solid's body sees it.
+  V depth(int row, const Spot<V>& s, const V* own) const {
+    Beside<V, 3> beside;
+    switch (bodies.meeting[row]) {
+      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
+      default: Face::beside(s, solid(row), own, beside);
+    }
+    return V(radius(row)) - beside.distance;
+  }
+
   // Where a candidate of a group is in a lane.
   int* slot(int group, int i, int which) const {
     int first = 0;
@@ -224,18 +236,6 @@ template <class V, class N, int D> struct Slots {
     s.share = Ellipsoid::share(s.lying, dot(axis, plane.normal));
     return bodies.meeting[row] == ROUND_ON_ROUND ? sunk<Approaching>(s, curved(row), one, other, c, plane)
                                                  : sunk<Ellipsoid>(s, curved(row), one, other, c, plane);
-  }
-
-  // At a point as the solid's body sees it.
-  V depth(int row, const Spot<V>& s, const V* own) const {
-    Beside<V, 3> beside;
-    switch (bodies.meeting[row]) {
-      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
-      default: Face::beside(s, solid(row), own, beside);
-    }
-    return V(radius(row)) - beside.distance;
   }
 };
 
