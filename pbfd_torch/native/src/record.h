@@ -184,6 +184,7 @@ template <class V, class N, class Scheme> struct Recorder {
     scheme.begin(balance, before, guess, M(false));
     contacts.begin(balance.start, balance.target, balance.dt);
     balance.meetings.begin(M(true), balance.start, balance.target, balance.dt, true);
+    balance.meetings.look(balance.now);  // in rows that have just been found
     V worst = listed(roster.still_strain()), number = listed(roster.still_suspect());
     auto strained = [&](V share, int danger) {  // of those strained alike, the first
       const V this_one = V(T(danger));
