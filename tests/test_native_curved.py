@@ -12,6 +12,7 @@ from pbfd_torch import Scene, Simulator
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models import SCENES
+from pbfd_torch.native.calls import Calls
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import Status
@@ -145,3 +146,22 @@ def test_records() -> None:
     same = (found.contact_point - expected.contact_point).abs().amax(-1) < 1e-12
     assert float(same.double().mean()) > 0.99
     assert bool(same[expected.contact_depth > 0].all())
+
+
+def test_nothing_is_read_before_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps are the same bits after zeros, after ones and after NaNs (bytes 255) in the core's memory."""
+    simulator = Simulator(pile(CURVED["all"]), DT)
+    q, v = thrown_together(simulator.scene, 5)
+    ends, room = [], Calls._room
+    for byte in (0, 1, 255):
+
+        def filled(calls: Calls, byte: int = byte) -> Any:
+            found = room(calls)
+            found._memory.fill_(byte)
+            return found
+
+        monkeypatch.setattr(Calls, "_room", filled)
+        rollout = simulator.rollout(simulator.initial_state(q, v), steps=2)
+        ends.append(torch.cat([x.flatten() for x in (rollout.q, rollout.contact_force, rollout.contact_point)]))
+    assert torch.equal(ends[0], ends[1])
+    assert torch.equal(ends[0], ends[2])
