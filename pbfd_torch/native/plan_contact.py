@@ -14,6 +14,7 @@ from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.height_field import HeightSurface
 from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSurface, SphereSurface
 from pbfd_torch.contact.surface import Plane
+from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -53,6 +54,7 @@ class Candidates:
     """Of all contact terms.
 
     Attributes:
+        carriers: of the obstacles that move; movers: which of them carries the solid of each candidate, −1: none.
         indices: node, solid, form and place among the anchors (−1: none) of each candidate of each kind.
         places: of each, among the candidates of all terms, those that ride on the world too; `taken`: how many these are.
         rows: the numbers of each candidate of each kind, `[*, …]` each, as all of these that follow.
@@ -62,7 +64,9 @@ class Candidates:
         anchors: how many each contact has: none, or one for each candidate, those of links that ride on the world too.
     """
 
+    carriers: Carriers = field(default_factory=Carriers)
     indices: list[list[tuple[int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    movers: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     places: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     taken: int = 0
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
@@ -84,6 +88,11 @@ class Candidates:
     def order(self) -> tuple[int, ...]:
         """The places of all candidates, sorted."""
         return tuple(chain(*self.places))
+
+    @property
+    def carried(self) -> list[int]:
+        """What carries the solid beside each, sorted."""
+        return list(chain(*self.movers))
 
     @property
     def grips(self) -> list[Tensor]:
@@ -145,6 +154,7 @@ class Candidates:
                 support, form = (POINT if flat and not rounded[i] else BALL), 0
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
+            self.movers[kind].append(-1)
             self.places[kind].append(before + i)
             self.rows[kind].append([positions[..., i, :], *(x[..., i, None] for x in numbers)])
 

@@ -39,7 +39,8 @@ class _Record(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
         ("given", ctypes.c_void_p * 10),
         ("found", ctypes.c_void_p * 10),
-        *((name, ctypes.c_void_p) for name in ("hazards", "own", *_STATE, *CONTACT, "suspect")),
+        *((name, ctypes.c_void_p) for name in ("hazards", "own", *_STATE, *CONTACT, "suspect", "poses")),
+        ("timed", ctypes.c_int),
     )
 
 
@@ -64,6 +65,8 @@ class Writer(Generic[S]):
             asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
         for name, array in arrays.items():
             setattr(asked, name, array.data_ptr())
+        poses = self._plan.carriers.poses(torch.cat((before.time[None], states.time)))
+        asked.poses, asked.timed = poses.data_ptr(), poses.shape[1]
         own, r = whole(self._own, (*batch, self._own.shape[-1])), self.roster
         asked.own = own.data_ptr()
         real = r.real if r.real.ndim == 1 else whole(r.real, (*batch, r.real.shape[-1]))

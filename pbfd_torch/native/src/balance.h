@@ -6,6 +6,7 @@
 // inertia on the chord, s̄ the twists there, w its share and A with what bends them (inertia.h),
 //   r_i = s̄_i · W,  ∂r_i/∂θ_j = s̄_iᵀ A s_j + w s_j · Y_i.
 #pragma once
+#include "carriers.h"
 #include "contact.h"
 #include "inertia.h"
 #include "joints.h"
@@ -30,6 +31,7 @@ template <class V, class N, int D = 3> struct Balance {
   V *axes, *chord_axes, *chord, *residual, *slopes, *matrix;
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
+  Carriers<V> carriers;
   Contacts<V, N, D> contacts;
   Meetings<V, N, D> meetings;
 
@@ -37,16 +39,18 @@ template <class V, class N, int D = 3> struct Balance {
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
            in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
-           (3 * S + 4 + s.nv) * s.nv + held(s);
+           (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
   template <class X> static X* taken(Arena<V>& arena, int count) {
     return reinterpret_cast<X*>(arena.take(in_registers<X>(count)));
   }
 
-  Balance(const Plan<N, D>& scene, Arena<V>& arena) : plan(scene), contacts(scene, relaxed, arena), meetings(scene, relaxed, arena) {
+  Balance(const Plan<N, D>& scene, Arena<V>& arena)
+      : plan(scene), carriers(scene, arena), contacts(scene, relaxed, arena), meetings(scene, relaxed, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
+    start.carriers = carriers.start, target.carriers = now.carriers = carriers.end;
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
     fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan));
@@ -70,6 +74,7 @@ template <class V, class N, int D = 3> struct Balance {
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
+    if (plan.moving > 0) carriers.begin(plan.belt, dt);
     contacts.begin(start, target, dt);
     meetings.begin(anew, start, target, dt, sorted);
     if (meetings.slots.changed) part(), meetings.slots.changed = false;

@@ -16,6 +16,7 @@ inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0;
 struct Sizes : CandidateSizes {
   int nodes, nq, nv, nu, halvings, pushes;
   BodySizes bodies = {};
+  int moving = 0;  // obstacles
 };
 
 template <class N, int D = 3> struct Plan : Sizes {
@@ -43,6 +44,9 @@ template <class N, int D = 3> struct Plan : Sizes {
   const N *push_point, *push;  // [3] on the node, [3] in the world
   Bodies<typename Kind<N>::Scalar> pairing;
   const N* laws;               // [LAWS_OF_A_ROW · rows] of contact between bodies
+  // where obstacles move: which of them carries the solid of each contact candidate, −1: none; velocities [3] of belts in their frames
+  const int* mover;
+  const N* belt;
   // the scene
   const N *gravity;  // [D]
   const N *reach;    // [m]
@@ -70,12 +74,15 @@ template <class N, int D = 3> struct Plan : Sizes {
     pushed = whole(pushes), push_point = real(3 * pushes), push = real(3 * pushes);
     if (bodies.rows > 0) pairing = Bodies<typename Kind<N>::Scalar>(bodies, body_ints, body_reals);
     laws = real(LAWS_OF_A_ROW * bodies.rows);
+    mover = whole(moving ? candidates : 0), belt = real(3 * moving);
   }
 
-  static int whole_numbers(Sizes s) { return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.pushes + Candidates<N, D>::whole_numbers(s); }
+  static int whole_numbers(Sizes s) {
+    return 5 * s.nodes + s.nv * (1 + s.nv) + 2 * s.nu + s.pushes + (s.moving ? s.candidates : 0) + Candidates<N, D>::whole_numbers(s);
+  }
   static int real_numbers(Sizes s) {
     return (2 * D * (D + 1) + 4) * s.nodes + (11 + s.halvings) * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes +
-           LAWS_OF_A_ROW * s.bodies.rows + Candidates<N, D>::real_numbers(s);
+           LAWS_OF_A_ROW * s.bodies.rows + 3 * s.moving + Candidates<N, D>::real_numbers(s);
   }
 };
 
