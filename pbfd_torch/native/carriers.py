@@ -54,8 +54,8 @@ class Carriers:
             time = first
         poses = [x.pose(time) for x in self.each]
         poses = [torch.cat((x[..., :3, :3].flatten(-2), x[..., :3, 3]), -1) for x in poses]
-        same = all(x.numel() == 12 * len(x) for x in poses)
-        told = torch.stack([x.expand(-1, *(ones if same else batch), -1) for x in poses], -2)
+        same = all(x.shape[-1 - len(batch) : -1].numel() == 1 for x in poses)
+        told = torch.stack([x.expand(len(time), *(ones if same else batch), 12) for x in poses], -2)
         return told.reshape(len(time), 1 if same else batch.numel(), len(self), 12).contiguous()
 
 

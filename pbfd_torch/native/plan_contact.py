@@ -132,6 +132,8 @@ class Candidates:
         anchored = isinstance(term.friction, AnchoredFriction)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
         moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0], dtype=torch.long)  # others ride on the world
+        if len(moving) < len(nodes) and _runs(term):
+            raise unknown(f"what does not move against '{name}', which does")
 
         numbers = (term.radius, term.margin, *laws_of(a, term, f"'{name}'", len(nodes)))
         anchor = sum(self.anchors)
@@ -140,7 +142,8 @@ class Candidates:
         self.taken += len(nodes)
         if len(moving) == 0:
             return
-        solid, first = self._solid(a, term, name), self.sizes[-1]
+        mover = self._mover(term)
+        solid, first = self._solid(a, term, name, mover >= 0), self.sizes[-1]
         positions, flat = on_nodes(a, term.link, term.position), isinstance(term.surface, Plane)
         rounded = (term.radius > 0).reshape(-1, len(nodes)).any(0).tolist()  # in some world
         if isinstance(term, CurvedContact):
@@ -154,19 +157,19 @@ class Candidates:
                 support, form = (POINT if flat and not rounded[i] else BALL), 0
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
-            self.movers[kind].append(-1)
+            self.movers[kind].append(mover)
             self.places[kind].append(before + i)
             self.rows[kind].append([positions[..., i, :], *(x[..., i, None] for x in numbers)])
 
-    def _solid(self, a: Articulation, term: Contact, name: str) -> int:
-        """Adds what is touched; its number."""
-        surface, carrier = term.surface, term.carrier
-        frame = torch.eye(4, dtype=a.dtype)
-        if carrier is not None:
-            if carrier.motion.moves or any(carrier.motion.belt):
-                raise unknown(f"contact with '{name}', which moves")
-            frame = carrier.start
-        if isinstance(surface, Plane) and carrier is None:
+    def _mover(self, term: Contact) -> int:
+        """The number of what carries the solid; −1: it stands, and so does its surface."""
+        return self.carriers.number(term.carrier) if term.carrier is not None and _runs(term) else -1
+
+    def _solid(self, a: Articulation, term: Contact, name: str, moves: bool) -> int:
+        """Adds what is touched, in its own frame if that moves; its number."""
+        surface = term.surface
+        frame = torch.eye(4, dtype=a.dtype) if moves or term.carrier is None else term.carrier.start
+        if isinstance(surface, Plane) and (moves or term.carrier is None):
             self.planes.append(joined(_one(surface.normal, 1, name), _one(surface.offset, 0, name)))
             return len(self.planes) - 1
         grid, sizes = [0, 0, 0, 0], list[Tensor]()
@@ -232,6 +235,11 @@ def laws_of(a: Articulation, term: ContactLaws[Any], name: str, count: int) -> S
         1.0 / each(law.release, 0.0),
         1.0 / each(width, 1.0),
     )
+
+
+def _runs(term: Contact) -> bool:
+    """Whether the solid of a contact moves, or its surface does."""
+    return term.carrier is not None and (term.carrier.motion.moves or any(term.carrier.motion.belt))
 
 
 def _differing(name: str) -> NotCompiledError:

@@ -47,7 +47,7 @@ template <class V, class N, int D = 3> struct Balance {
   }
 
   Balance(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), carriers(scene, arena), contacts(scene, relaxed, arena), meetings(scene, relaxed, arena) {
+      : plan(scene), carriers(scene, arena), contacts(scene, relaxed, carriers, arena), meetings(scene, relaxed, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start.carriers = carriers.start, target.carriers = now.carriers = carriers.end;

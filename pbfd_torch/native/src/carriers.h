@@ -51,6 +51,21 @@ template <class V> struct Carriers {
     product(swung + 9 * m, R, out);
     for (int j = 0; j < 9; j++) out[j] += R[j];
   }
+
+  // How a solid sees a point at the end of the step; vectors turned from its frame into the world's, and back, in place if asked.
+  void to_own(int m, const V* x, V* out) const {
+    const V* to = end + 12 * m;
+    const V off[3] = {x[0] - to[9], x[1] - to[10], x[2] - to[11]};
+    transposed_times(to, off, out);
+  }
+  void turn(int m, const V* x, V* out) const {
+    const V own[3] = {x[0], x[1], x[2]};
+    times(end + 12 * m, own, out);
+  }
+  void turn_back(int m, const V* x, V* out) const {
+    const V in_world[3] = {x[0], x[1], x[2]};
+    transposed_times(end + 12 * m, in_world, out);
+  }
 };
 
 }  // namespace pbfd
