@@ -97,3 +97,42 @@ def table(motion: Motion, shape: Solid = Box((0.6, 0.5, 0.1)), position: Any = (
 def stepper(scene: Scene, dt: float = 0.01, scheme: Any = None) -> NativeStepper[Any]:
     """By the core."""
     return NativeStepper(Simulator(scene, dt, scheme).eager)
+
+
+def crowd(motion: Motion, shapes: Sequence[Shape], worlds: int = 0) -> Scene:
+    """Bodies on a table that moves, beside obstacles that move in another way and one that does not. worlds: where the table begins
+    elsewhere in each."""
+    block = Obstacle("block", Box((0.2, 0.2, 0.1)), (0.3, 0.2, 0.0), motion=Lift.steady((-0.5, 0.3, 0.2)))
+    wheel = Obstacle("wheel", Box((0.15, 0.2, 0.1)), (-0.3, -0.1, 0.0), motion=Turntable(2.0, (0.0, 1.0, 0.3), (-0.3, 0.0, 0.0)))
+    still = Obstacle("still", Box((0.1, 0.1, 0.1)), (0.0, 0.3, 0.0))
+    own = (0.1 * drawn(worlds, 3, seed=8) + torch.tensor([0.0, 0.0, -0.1]),) if worlds else ()
+    return over(shapes, (table(motion, Box((0.6, 0.5, 0.1)), *own), block, wheel, still))
+
+
+def riding(
+    motion: Motion,
+    shapes: Sequence[Shape],
+    friction: FrictionLaw | None = None,
+    dtype: torch.dtype = torch.float64,
+    height: float = 0.0,
+) -> Scene:
+    """Bodies side by side on a table that moves, some of them beside a block that pushes them. height: of the table's top [m]."""
+    pushes = Lift(lambda time: 0.05 * torch.sin(5 * time), (1.0, 0.0, 0.0))
+    block = Obstacle("block", Box((0.1, 0.6, 0.15)), (-0.85, 0.0, 0.15 + height), motion=pushes)
+    still = Obstacle("still", Box((0.1, 0.1, 0.1)), (0.0, 0.6, 0.0))
+    top = table(motion, Box((0.9, 0.9, 0.1)), (0.0, 0.0, height - 0.1), (1.0, 0.0, 0.0, 0.0))
+    return over(shapes, (top, block, still), friction, dtype)
+
+
+def laid(scene: Scene, time: Tensor, seed: int = 0, turn: float = 0.3, speed: float = 0.3) -> tuple[Tensor, Tensor]:
+    """Configurations of free bodies above the first obstacle as it stands at times `[worlds]`, and velocities."""
+    a, worlds = scene.articulation, len(time)
+    pose = scene.obstacles[0].motion.pose(time)
+    q, v = a.rest.repeat(worlds, 1), speed * drawn(worlds, a.nv, seed=seed).to(a.dtype)
+    free = [first for first, size in zip(a.topology.q_start, a.topology.joint_sizes, strict=True) if size == (7, 6)]
+    for k, first in enumerate(free):
+        part = drawn(worlds, 6, seed=seed + 10 * k + 1).to(a.dtype)
+        p = a.rest.new_tensor([0.5 * k - 0.5, -0.3, 0.17]) + a.rest.new_tensor([0.1, 0.1, 0.02]) * part[:, :3]
+        q[:, first : first + 3] = (pose[:, :3, :3] @ p[..., None]).squeeze(-1) + pose[:, :3, 3]
+        q[:, first + 3 : first + 7] = quaternion_exp(turn * part[:, 3:])
+    return q, v

@@ -15,6 +15,7 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.motion import Lift, Motion, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Cylinder
+from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import Status
@@ -23,8 +24,9 @@ from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.tree.kinematics import retract
-from tests.native_moving import MOTIONS, SCHEMES, drawn, over, table, thrown, timed
-from tests.native_parity import DT, require_balance, require_starts, resting
+from tests.native_moving import MOTIONS, SCHEMES, crowd, drawn, laid, riding, thrown, timed
+from tests.native_parity import DT, fields, require_balance, resting
+from tests.native_parity import begun as begun_from
 from tests.native_piles import SHAPES
 from tests.test_native_anchors import anchored, require_kept, stretched
 from tests.test_native_contact import BALLS, CONVEX, CURVED, GROUND, SOLIDS, beside, require_touching, touching
@@ -84,15 +86,6 @@ def test_fast_balls_do_not_pass_through(solid: str) -> None:
     require_balance(scene, state, q)
 
 
-def crowd(motion: Motion, shapes: str = "boxes", worlds: int = 0, **kwargs: Any) -> Scene:
-    """Bodies on a table that moves, beside obstacles that move in another way and one that does not."""
-    block = Obstacle("block", Box((0.2, 0.2, 0.1)), (0.3, 0.2, 0.0), motion=Lift.steady((-0.5, 0.3, 0.2)))
-    wheel = Obstacle("wheel", Box((0.15, 0.2, 0.1)), (-0.3, -0.1, 0.0), motion=Turntable(2.0, (0.0, 1.0, 0.3), (-0.3, 0.0, 0.0)))
-    still = Obstacle("still", Box((0.1, 0.1, 0.1)), (0.0, 0.3, 0.0))
-    own = (0.1 * drawn(worlds, 3, seed=8) + torch.tensor([0.0, 0.0, -0.1]),) if worlds else ()
-    return over(SHAPES[shapes], (table(motion, Box((0.6, 0.5, 0.1)), *own), block, wheel, still), **kwargs)
-
-
 @pytest.mark.parametrize("shapes", SHAPES)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_bodies_on_obstacles(motion: str, shapes: str) -> None:
@@ -100,9 +93,59 @@ def test_bodies_on_obstacles(motion: str, shapes: str) -> None:
     worlds = 60
     starts = [0] if motion == "conveyor" else [0, worlds]
     for own in starts:
-        scene = crowd(MOTIONS[motion], shapes, own)
+        scene = crowd(MOTIONS[motion], SHAPES[shapes], own)
         q, v = thrown(scene, worlds)
         state = timed(resting(q, v), drawn(worlds, seed=2) + 1)
         end = retract(scene.articulation, q, DT * v)
         require_touching(scene, state, end)
         require_balance(scene, state, end)
+
+
+RIDES = [("turntable", "boxes"), ("tilted", "polytopes"), ("lift", "balls on boxes"), ("rocking", "round"), ("conveyor", "boxes")]
+EACH = [(EnergyMomentum(), *ride) for ride in RIDES] + [
+    *((scheme, *RIDES[k]) for k, scheme in enumerate(SCHEMES)),
+    *((scheme, *RIDES[3 - k]) for k, scheme in enumerate(SCHEMES)),
+]
+
+
+def begun(scene: Scene, worlds: int, scheme: Any, dt: float = DT, before: int = 15) -> tuple[NativeStepper[Any], Any]:
+    """States that have made some steps, at other times in each world."""
+    native = NativeStepper(Simulator(scene, dt, scheme).eager)
+    time = (drawn(worlds, seed=6) + 1).to(scene.articulation.dtype)
+    state = native.initial_state(*laid(scene, time), None)
+    states, _ = native.run(timed(state, time), None, before)
+    return native, mapped(lambda x: x[-1], states)
+
+
+@pytest.mark.parametrize(("scheme", "motion", "shapes"), EACH)
+def test_steps(scheme: Any, motion: str, shapes: str) -> None:
+    """To the same root as the reference's, and on from it alike, where both solve the step directly."""
+    native, state = begun(riding(MOTIONS[motion], SHAPES[shapes]), 12, scheme)
+    direct = same = 0
+    for _ in range(3):
+        after, solution, _ = native.made(state, None)
+        expected, found, _ = native.eager.made(state, None)
+        both = (solution.status == found.status) & (found.status <= int(Status.EASED))
+        alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
+        direct, same = direct + int(both.sum()), same + int(alike.sum())
+        assert torch.equal(after.time, expected.time)
+        assert torch.equal(after.hazards[alike], expected.hazards[alike])
+        for name, ours in vars(after).items():
+            theirs = getattr(expected, name)
+            if isinstance(ours, Tensor) and ours.dtype == torch.float64:
+                assert torch.allclose(ours[alike], theirs[alike], rtol=1e-5, atol=1e-3, equal_nan=True), name
+        state = after
+    assert direct >= 18
+    assert same >= 0.97 * direct
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(("motion", "shapes"), RIDES)
+def test_starts(motion: str, shapes: str, scheme: Any) -> None:
+    """What the reference makes of where the core's trial ends, which feels obstacles as they move from t = 0 on."""
+    native = NativeStepper(Simulator(riding(MOTIONS[motion], SHAPES[shapes], height=0.1), DT, scheme).eager)
+    q, v = laid(native.scene, torch.zeros(12, dtype=torch.float64))
+    start = begun_from(native, q, v, None)
+    for name, ours, theirs in fields(start.state, start.reference):
+        size = 1.0 + float(theirs.nan_to_num(0.0).abs().max())
+        assert torch.allclose(ours, theirs, 0.0, 1e-8 * size, equal_nan=True), name
