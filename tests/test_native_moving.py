@@ -16,6 +16,7 @@ from pbfd_torch.contact.motion import Lift, Motion, Turntable
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Cylinder
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.native.engine import Native
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import Status
@@ -31,6 +32,7 @@ from tests.native_piles import SHAPES
 from tests.test_native_anchors import anchored, require_kept, stretched
 from tests.test_native_contact import BALLS, CONVEX, CURVED, GROUND, SOLIDS, beside, require_touching, touching
 from tests.test_native_fallbacks import require_equal
+from tests.test_native_records import recorded, require_same
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -149,3 +151,84 @@ def test_starts(motion: str, shapes: str, scheme: Any) -> None:
     for name, ours, theirs in fields(start.state, start.reference):
         size = 1.0 + float(theirs.nan_to_num(0.0).abs().max())
         assert torch.allclose(ours, theirs, 0.0, 1e-8 * size, equal_nan=True), name
+
+
+def test_parts_of_steps() -> None:
+    """Steps that are made in parts, of bodies that spin fast on a table, end where shorter steps end one after the other: obstacles
+    are where they are then."""
+    worlds, judged, alike, moved = 40, 0, 0, 0
+    for motion, shapes in RIDES[:3]:
+        scene = riding(MOTIONS[motion], SHAPES[shapes][:1])
+        native = NativeStepper(Simulator(scene, 0.05).eager)
+        time = drawn(worlds, seed=6) + 1
+        state = timed(resting(*laid(scene, time, speed=20.0)), time)
+        for _ in range(3):
+            after, solution, _ = native.made(state, None)
+            for times in (1, 2, 3):
+                chosen = (solution.status == int(Status.HALVED)) & (solution.fallbacks[:, 3] == times)
+                some = Worlds((worlds,), chosen.nonzero().squeeze(-1))
+                end = in_parts(native, state.take(some), 2**times, lambda t: t)
+                still = in_parts(native, state.take(some), 2**times, torch.zeros_like)
+                gap = (end.q - after.q[some.index]).abs().amax(-1)
+                judged, alike = judged + len(gap), alike + int((gap < 1e-9).sum())
+                moved += int(((still.q - end.q).abs().amax(-1) > 1e-6).sum())
+            state = after
+    assert judged >= 10
+    assert alike >= 0.9 * judged
+    assert moved >= 5
+
+
+def in_parts(native: NativeStepper[Any], state: Any, parts: int, clock: Any) -> Any:
+    """So many shorter steps from a state, whose time is what the clock makes of it."""
+    eager = native.eager
+    short = NativeStepper(eager.with_scheme(eager.integrator, eager.solver, 0, eager.step_size / parts))
+    state = eager.integrator.resized(eager.articulation, state, eager.step_size, short.step_size)
+    for _ in range(parts):
+        state, _, _ = short.made(timed(state, clock(state.time)), None)
+    return eager.integrator.resized(eager.articulation, state, short.step_size, eager.step_size)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(("motion", "shapes"), RIDES)
+def test_records(motion: str, shapes: str, scheme: Any) -> None:
+    """PyTorch's of the same states."""
+    simulator = Simulator(riding(MOTIONS[motion], SHAPES[shapes]), DT, scheme, engine=Native())
+    _, state = begun(simulator.scene, 9, scheme)
+    found, expected = recorded(simulator, state, None, 4)
+    require_same(found, expected)
+    assert bool((found.contact_force.norm(dim=-1) > 0).any())
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize(("solid", "kind"), BESIDE)
+def test_records_of_candidates(solid: str, kind: Any, motion: str) -> None:
+    """And the energy that contacts store, with anchors."""
+    moving = placed((PLANE | SOLIDS)[solid], 12, MOTIONS[motion])
+    scene = anchored(touching(BALLS if kind is Contact else CURVED, (moving, GROUND), kind))
+    state, _ = beside(scene, 12, time=drawn(12, seed=5) + 1)
+    require_same(*recorded(Simulator(scene, DT, engine=Native()), stretched(scene, state), None, 2))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(("motion", "shapes"), [RIDES[1], RIDES[3]])
+def test_no_world_knows_another(motion: str, shapes: str, dtype: torch.dtype, scheme: Any) -> None:
+    """To the bit: many steps in one call or one by one, in a batch of other times, in another place of it, by itself, on
+    threads; and where all times are the same."""
+    worlds, steps = 21, 6
+    native, state = begun(riding(MOTIONS[motion], SHAPES[shapes], dtype=dtype), worlds, scheme)
+    states, solution = native.run(state, None, steps)
+    one, at = torch.tensor(0), state
+    for k in range(steps):
+        at, solved, _ = native.made(at, None)
+        whole, found = (mapped(lambda x, k=k: x[k].unsqueeze(1), x) for x in (states, solution))
+        require_equal(at, whole, solved, found, one)
+    for index in (torch.tensor([20, 3, 11, 5, 0]), torch.tensor([7]), torch.tensor([8])):
+        some, solved = native.run(state.take(Worlds((worlds,), index)), None, steps)
+        require_equal(some, states, solved, solution, index)
+    threaded = NativeStepper(native.eager, threads=3).run(state, None, 40)
+    single = NativeStepper(native.eager, threads=1).run(state, None, 40)
+    require_equal(threaded[0], single[0], threaded[1], single[1], torch.arange(worlds))
+    alike = state.take(Worlds((worlds,), torch.full((worlds,), 4)))
+    some, solved = native.run(alike, None, steps)
+    require_equal(some, states, solved, solution, torch.full((worlds,), 4))

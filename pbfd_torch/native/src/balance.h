@@ -74,7 +74,6 @@ template <class V, class N, int D = 3> struct Balance {
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
-    if (plan.moving > 0) carriers.begin(plan.belt, dt);
     contacts.begin(start, target, dt);
     meetings.begin(anew, start, target, dt, sorted);
     if (meetings.slots.changed) part(), meetings.slots.changed = false;

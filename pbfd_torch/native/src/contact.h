@@ -14,7 +14,7 @@ template <class V, class N, int D> struct Contacts {
   const Candidates<N, D>& candidates;
   const V* grip = nullptr;  // μ [candidates] of the worlds in the lanes
   const Relaxed<V>& relaxed;
-  const Carriers<V>& carriers;
+  Carriers<V>& carriers;
   // what is fixed in a step
   const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
   Poses<V> before;  // of the nodes at its start
@@ -31,7 +31,7 @@ template <class V, class N, int D> struct Contacts {
   static int room(Sizes s) {
     return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Carriers<V>& moving, Arena<V>& arena)
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Carriers<V>& moving, Arena<V>& arena)
       : plan(scene), candidates(scene.contact), relaxed(easier), carriers(moving) {
     share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
@@ -41,6 +41,7 @@ template <class V, class N, int D> struct Contacts {
   // The step begins at these poses, and would lead to `free` without contacts.
   void begin(Poses<V> start, Poses<V> free, V step) {
     before = start, per_dt = V(1) / step;
+    if constexpr (D == 3) carriers.begin(plan.belt, step);
     each_kind(candidates, [&](auto pair, int first, int last) {
       using Surface = typename decltype(pair)::Surface;
       using Support = typename decltype(pair)::Support;
