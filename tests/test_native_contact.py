@@ -17,7 +17,6 @@ from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.height_field import HeightField
-from pbfd_torch.contact.motion import Conveyor
 from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import Velocities
@@ -74,13 +73,16 @@ def touching(shapes: Sequence[Shape], solids: Sequence[Solid], kind: Any = Conta
     return Scene(a, tuple(terms), torch.tensor([0.3, 0.0, -9.81], dtype=dtype))
 
 
-def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tuple[Velocities, Tensor]:
+def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3, time: Tensor | None = None) -> tuple[Velocities, Tensor]:
     """Random states, and configurations at which a step of theirs may end, with one candidate at the surface of one solid: up to
-    a centimetre deeper or less. speed: standard deviation [m/s, rad/s]."""
+    a centimetre deeper or less. speed: standard deviation [m/s, rad/s]; time: of the states `[worlds]` [s]."""
     random = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(*shape, dtype=torch.float64, generator=random).to(a.dtype)
+
+    def at(state: Velocities) -> Velocities:
+        return state if time is None else dataclasses.replace(state, time=time.to(a.dtype))
 
     a = scene.articulation
     contacts = [term for term in scene.terms if isinstance(term, Contact)]
@@ -88,7 +90,7 @@ def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tupl
     depth = 0.003 * normal(worlds)
     every = torch.arange(worlds)
     for _ in range(4):  # along the normals until the depths fit
-        still = resting(q, torch.zeros_like(q[..., 1:]))
+        still = at(resting(q, torch.zeros_like(q[..., 1:])))
         step = Simulator(scene, DT).eager.objective(still).step
         for k, contact in enumerate(contacts):
             mine = every % len(contacts) == k
@@ -98,7 +100,7 @@ def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3) -> tupl
             q[:, :3] += torch.where(mine[:, None], shift, 0.0)
     q[:, :3] += 1e-4 * normal(worlds, 3)  # off the borders between faces
     v = speed * normal(worlds, a.nv)
-    return resting(retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v), q
+    return at(resting(retract(a, q, -DT * v + 1e-4 * normal(worlds, a.nv)), v)), q
 
 
 @pytest.mark.parametrize(
@@ -132,7 +134,6 @@ def test_friction_of_each_world() -> None:
     ("law", "solid", "words"),
     [
         (NormalForce(1e5).seen_from(1e-3), GROUND, "normal force on 'ground', a DistantForce"),
-        (NormalForce(1e5), HalfSpace(motion=Conveyor((1.0, 0.0, 0.0))), "contact with 'ground', which moves"),
         (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), "contact with 'hull', which is a ConvexSurface"),
     ],
 )

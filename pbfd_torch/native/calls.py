@@ -30,6 +30,7 @@ class _Plan(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),
         *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots", "remembered")),
         *((name, ctypes.c_void_p) for name in ("body_whole", "body_real")),
+        ("moving", ctypes.c_int),
     )
 
 
@@ -53,6 +54,7 @@ class Calls:
         self._bodies = torch.tensor(bodies.whole, dtype=torch.int32), bodies.real.to(plan.real.dtype)
         self._plan = _Plan(plan.real.element_size(), plan.dimension, *plan.sizes, len(plan.which), *tables, *bodies.size)
         self._plan.body_whole, self._plan.body_real = (x.data_ptr() for x in self._bodies)
+        self._plan.moving = len(plan.carriers)
         wanted = (self._asked("pbfd_whole_numbers"), self._asked("pbfd_real_numbers"))
         if wanted != (len(plan.whole), len(plan.real)):
             raise ValueError(f"the plan has {len(plan.whole)} and {len(plan.real)} numbers: the core wants {wanted}")

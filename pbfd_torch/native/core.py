@@ -12,6 +12,7 @@ from torch import Tensor
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.native.calls import Calls, whole
+from pbfd_torch.native.carriers import parted, passed
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.native.schemes import ON_POSITIONS, Scheme
@@ -33,6 +34,8 @@ class _Steps(ctypes.Structure):
         ("fallbacks", ctypes.c_void_p),
         ("own", ctypes.c_void_p),
         ("trial", ctypes.c_void_p * 7),
+        ("poses", ctypes.c_void_p),
+        ("timed", ctypes.c_int),
     )
 
 
@@ -55,14 +58,21 @@ class Journey:
     Attributes:
         given: what each world sets out from, `[*batch, ...]`, q first.
         control: `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. own: see `Plan`.
+        poses: of the obstacles that move, at the ends of all parts of all steps, see `Carriers.poses`.
         found: what it has after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
         residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
     """
 
     def __init__(
-        self, given: dict[str, Tensor], found: dict[str, Tensor], control: Tensor, steps: tuple[int, ...], own: Tensor
+        self,
+        given: dict[str, Tensor],
+        found: dict[str, Tensor],
+        control: Tensor,
+        steps: tuple[int, ...],
+        own: Tensor,
+        poses: Tensor,
     ) -> None:
-        self.given, self.found = given, found
+        self.given, self.found, self.poses = given, found, poses
         batch = tuple(given["q"].shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
         self.control = whole(control, (len(control), *batch, control.shape[-1]))
@@ -83,6 +93,7 @@ class Journey:
         asked.counted[:] = [x.data_ptr() for x in self.counted.values()]
         asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
         asked.own = self.own.data_ptr()
+        asked.poses, asked.timed = self.poses.data_ptr(), self.poses.shape[1]
         return asked
 
     @property
@@ -105,7 +116,8 @@ class Core:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
         threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
         given = self._scheme.fields(state, self.plan)
-        journey = Journey(given, {name: _room_for(x, steps) for name, x in given.items()}, control, steps, self.plan.own)
+        found = {name: _room_for(x, steps) for name, x in given.items()}
+        journey = Journey(given, found, control, steps, self.plan.own, self._poses(state.time, math.prod(steps)))
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
@@ -114,7 +126,8 @@ class Core:
         """The fields of the states at t = 0 of all worlds at q `[*batch, nq]` with v `[*batch, nv]` under a control `[1, *batch,
         nu]`, and how their trial steps were solved; and where these have ended, `[*batch, nq]`."""
         given = {"q": whole(q, q.shape), "v": whole(v, v.shape)}
-        journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.own)
+        poses = self._poses(torch.zeros_like(q[..., 0]), 1)
+        journey = Journey(given, self._empty(self._scheme, q), control, (), self.plan.own, poses)
         asked = journey.call(self._terms)
         (_, *before), end = self._empty(ON_POSITIONS, q).values(), self._empty(ON_POSITIONS, q)
         asked.trial[:] = [x.data_ptr() for x in (*before, *end.values())]
@@ -126,12 +139,19 @@ class Core:
         shapes = scheme.shapes(self.plan) | {"memory": (self.plan.remembered,)}
         return {name: q.new_empty((*q.shape[:-1], *shape)) for name, shape in shapes.items()}
 
+    def _poses(self, time: Tensor, steps: int) -> Tensor:
+        """Where the obstacles that move are at the ends of all parts of so many steps from a time `[*batch]` on."""
+        if not self.plan.carriers:
+            return time.new_empty(0, 1, 0, 12)
+        step = time.new_tensor(self._terms.dt)
+        return self.plan.carriers.poses(parted(passed(time, step, steps), step, 2**self.plan.halvings))
+
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
         """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and
         J `[*batch, nv, nv]`."""
         batch, (_, _, nv, nu) = tuple(state.q.shape[:-1]), self.plan.sizes[:4]
         held = q.new_zeros(1, *batch, nu) if control is None else control.expand(1, *batch, nu)
-        journey = Journey(self._scheme.fields(state, self.plan), {}, held, (), self.plan.own)
+        journey = Journey(self._scheme.fields(state, self.plan), {}, held, (), self.plan.own, self._poses(state.time, 1))
         at, residual, jacobian = whole(q, q.shape), q.new_empty(*batch, nv), q.new_empty(*batch, nv, nv)
         addresses = [ctypes.c_void_p(x.data_ptr()) for x in (at, residual, jacobian)]
         self._calls.make("pbfd_balance", journey.call(self._terms), *addresses)

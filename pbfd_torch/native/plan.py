@@ -14,6 +14,7 @@ from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.fitted import Fitted
 from pbfd_torch.native.aligned import aligned
+from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_bodies import Bodies
@@ -45,9 +46,9 @@ class Plan:
     """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
-    μ: the core knows these in space only, and not with BDF2. order: where the candidates are among those of all contact terms.
-    memory: of each term that remembers, in the order of a state's memory, where it begins among all numbers that are remembered,
-    and its shape; remembered: how many these are. seats: where links are on the nodes."""
+    μ: the core knows these in space only, and not with BDF2. carriers: of the obstacles that move. order: where the candidates are
+    among those of all contact terms. memory: of each term that remembers, in the order of a state's memory, where it begins among
+    all numbers that are remembered, and its shape; remembered: how many these are. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -58,6 +59,7 @@ class Plan:
     bodies: Bodies
     dimension: int
     apart: bool
+    carriers: Carriers
     order: tuple[int, ...]
     memory: tuple[tuple[int, int, int], ...]
     remembered: int
@@ -65,7 +67,12 @@ class Plan:
 
     def take(self, worlds: Worlds) -> Plan:
         """The plan of some worlds, to the bit."""
-        return replaced(self, own=worlds.pick(self.own, 1), seats=self.seats.take(worlds))
+        return replaced(self, own=worlds.pick(self.own, 1), seats=self.seats.take(worlds), carriers=self.carriers.take(worlds))
+
+    @property
+    def halvings(self) -> int:
+        """How often a step may be halved."""
+        return self.sizes[4]
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -75,7 +82,8 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     parts, bdf2 = _parts(stepper), isinstance(stepper.integrator, Bdf2)
     if parts.apart and bdf2:
         raise unknown("BDF2 of worlds that differ")
-    if parts.apart or bdf2 or parts.pushed or parts.bodies.rows or not parts.candidates.flat:  # of which the core knows space only
+    if parts.apart or bdf2 or parts.pushed or parts.bodies.rows or len(parts.carriers) or not parts.candidates.flat:
+        # of which the core knows space only
         return parts.plan()
     plane = plane_of(parts.a, [parts.gravity, *parts.candidates.normals])
     return (parts if plane is None else parts.within(plane)).plan()
@@ -101,6 +109,7 @@ class _Parts:
     gravity: Tensor
     candidates: Candidates
     bodies: Bodies
+    carriers: Carriers
     driven: list[int]
     pushed: list[int]
     halvings: int
@@ -114,7 +123,7 @@ class _Parts:
     def real(self) -> list[Tensor]:
         """All numbers."""
         nodes = (x.flatten(-rank) for x, rank in zip(self.nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True))
-        laws = [*self.bodies.laws, *self.candidates.laws.real()]
+        laws = [*self.bodies.laws, *self.candidates.laws.real(), *self.carriers.belts]
         return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes, *laws]
 
     @property
@@ -135,6 +144,7 @@ class _Parts:
         kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in sizes]
         whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
         whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed + candidates.laws.manners
+        whole += candidates.carried if len(self.carriers) else []
         real, which, own = _told_apart(self.real)
         return Plan(
             sizes=(t.njoint, t.nq, t.nv, len(self.driven) // 2, self.halvings, *candidates.sizes, len(self.pushed)),
@@ -144,6 +154,7 @@ class _Parts:
             own=own,
             sample=torch.cat([a.rest.new_empty(0), *candidates.samples]),
             bodies=self.bodies,
+            carriers=self.carriers,
             dimension=self.dimension,
             apart=self.apart,
             order=candidates.order,
@@ -170,7 +181,8 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
-        bodies=(bodies := Bodies.of(a, known.meetings, known.candidates.laws, 3 * sum(known.candidates.anchors))),
+        bodies=(bodies := Bodies.of(a, known.meetings, known.candidates.laws, known.carriers, 3 * sum(known.candidates.anchors))),
+        carriers=known.carriers,
         driven=driven,
         pushed=known.pushed,
         halvings=len(shares) - 1,
@@ -287,7 +299,8 @@ class _Terms:
         self.drives: Actuators | None = None  # what presses on the limits
         self.pushed: list[int] = []  # nodes
         self.pushes: list[tuple[Tensor, Tensor]] = []  # points and forces
-        self.candidates = Candidates()
+        self.carriers = Carriers()
+        self.candidates = Candidates(self.carriers)
         self.meetings: list[BodyContact] = []
         seen: set[type] = set()
         for term in stepper.terms:

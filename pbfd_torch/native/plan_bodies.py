@@ -17,6 +17,7 @@ from pbfd_torch.contact.hazards import Overflow
 from pbfd_torch.contact.polytope import Polytope
 from pbfd_torch.contact.polytope_pairs import PolytopePairs
 from pbfd_torch.contact.round_pairs import RoundPairs
+from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_contact import along
 from pbfd_torch.native.plan_curved import round_pair, round_table, row_of, shape_row
@@ -37,7 +38,9 @@ class Bodies:
     """Of all terms of contact between bodies.
 
     Attributes:
-        frames: of the bodies [4, 4] on their nodes, obstacles after all links; nodes: −1: the world. links: how many of them are.
+        frames: of the bodies [4, 4] on their nodes, obstacles after all links; nodes: −1: the world; obstacles that move have some
+            of their own after all others. links: how many bodies are links.
+        moving: the bodies that move, links first.
         kept, finders, ends: of each term how many candidates it keeps, what finds them, and how many pairs there are up to it.
         rows: of each its nodes, what meets what, its term, the place of its pair and its law (`Laws`); sizes: its numbers, `[49]`;
             laws: `[*, 8]`.
@@ -49,6 +52,7 @@ class Bodies:
     frames: Tensor
     nodes: list[int]
     links: int
+    moving: list[int]
     kept: list[int] = field(default_factory=list)
     finders: list[int] = field(default_factory=list)
     ends: list[int] = field(default_factory=lambda: [0])
@@ -66,18 +70,18 @@ class Bodies:
     remembered: int = 0
 
     @classmethod
-    def of(cls, a: Articulation, terms: Sequence[BodyContact], laws: Laws, before: int) -> Bodies:
-        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws. Raises
-        `NotCompiledError`."""
+    def of(cls, a: Articulation, terms: Sequence[BodyContact], laws: Laws, carriers: Carriers, before: int) -> Bodies:
+        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws, and the obstacles
+        that move to the carriers. Raises `NotCompiledError`."""
         frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
         obstacles = list(terms[0].obstacles) if terms else []
-        for x in obstacles:
-            if x.motion.moves:
-                raise unknown("bodies on an obstacle that moves")
-        starts = [x.start for x in obstacles]
+        eye = torch.eye(4, dtype=a.dtype)
+        starts = [eye if x.motion.moves else x.start for x in obstacles]
         if any(x.ndim > 2 for x in [frames[..., 0, :, :], *starts]):
             raise unknown("contact between bodies whose frames differ from world to world")
-        bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *(-1 for _ in starts)], len(nodes))
+        seats = [a.topology.njoint + carriers.number(x) if x.motion.moves else -1 for x in obstacles]
+        moving = [*range(len(nodes)), *(len(nodes) + k for k, seat in enumerate(seats) if seat >= 0)]
+        bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *seats], len(nodes), moving)
         for term in terms:
             bodies._take(a, term, laws, before)
         return bodies
@@ -88,7 +92,7 @@ class Bodies:
         if not self.rows:
             return 0, 0, 0, 0, 0, 0, 0
         counts = len(self.kept), len(self.rows), len(self.pairs), len(self.colliders)
-        return self.links, *counts, sum(self.kept), self.remembered
+        return len(self.moving), *counts, sum(self.kept), self.remembered
 
     @property
     def whole(self) -> list[int]:
@@ -98,7 +102,7 @@ class Bodies:
         tables = [*zip(*self.rows, strict=True), *zip(*(x[:4] for x in self.pairs), strict=True)]
         links = itertools.chain(*(x[4:] for x in self.pairs))
         colliders = zip(*self.colliders, strict=True)
-        whole = [*self.nodes[: self.links], *self.kept, *self.finders, *self.ends, *self.memory]
+        whole = [*(self.nodes[x] for x in self.moving), *self.kept, *self.finders, *self.ends, *self.memory]
         return [*whole, *itertools.chain(*tables), *links, *itertools.chain(*colliders), *self._hulls[0]]
 
     @property
@@ -107,7 +111,7 @@ class Bodies:
         like = self.frames
         if not self.rows:
             return like.new_empty(0)
-        links = [_flat(x) for x in self.frames[: self.links]]
+        links = [_flat(self.frames[x]) for x in self.moving]
         tables = (links, self.extents, [like.new_tensor(self.slack)], self.places, self.numbers, self.sizes)
         return torch.cat([*itertools.chain(*tables), self._hulls[1].to(like.dtype)])
 
@@ -134,11 +138,11 @@ class Bodies:
         self.memory.append(before + self.remembered if anchored else -1)
         self.remembered += 7 * term.finder.slots if anchored else 0
         self.ends.append(len(self.pairs))
-        self.extents.append(term.extent[: self.links])
+        self.extents.append(term.extent[self.moving])
         self.slack.append(term.slack)
 
     def _belt(self, term: BodyContact, body: int) -> Tensor:
-        """Velocity of the running surface of a body in the world, `[3]`."""
+        """Velocity of the running surface of a body on its node, `[3]`."""
         if body < self.links:
             return self.frames.new_zeros(3)
         return self.frames[body, :3, :3] @ term.obstacles[body - self.links].belt
@@ -162,9 +166,13 @@ class Bodies:
 
     def _pair(self, row: int, a: int, b: int, numbers: Tensor, colliders: tuple[int, int] = (0, 0), boxes: bool = False) -> None:
         """Adds one of bodies a and b."""
-        one, other = (x if x < self.links else -1 for x in (a, b))
+        one, other = (self._number(x) for x in (a, b))
         self.pairs.append((row, *colliders, int(boxes), one, other))
         self.numbers.append(torch.nn.functional.pad(numbers, (0, NUMBERS_OF_A_PAIR - len(numbers))))
+
+    def _number(self, body: int) -> int:
+        """Which of those that move a body is, −1: it does not."""
+        return self.moving.index(body) if body in self.moving else -1
 
     def _round(self, finder: RoundPairs) -> Iterator[tuple[int, int, int, Tensor, int]]:
         tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.axes, finder.radii)
@@ -192,7 +200,7 @@ class Bodies:
         """Two rows for each pair: either may give the points."""
         before, bodies = len(self.colliders), finder.body.tolist()
         for body, frame in zip(bodies, finder.frame, strict=True):
-            self.colliders.append((self.nodes[body], body if body < self.links else -1))
+            self.colliders.append((self.nodes[body], self._number(body)))
             self.places.append(_flat(self.frames[body] @ frame))
         self.polytopes += finder.polytopes
         table, curved = finder.table, isinstance(finder, CurvedPairs)

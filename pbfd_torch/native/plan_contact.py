@@ -13,6 +13,7 @@ from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.height_field import HeightSurface
 from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSurface, SphereSurface
 from pbfd_torch.contact.surface import Plane
+from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plan_laws import Law, Laws
 from pbfd_torch.native.plane import Plane as MotionPlane
@@ -49,6 +50,7 @@ class Candidates:
     """Of all contact terms.
 
     Attributes:
+        carriers: of the obstacles that move; movers: which of them carries the solid of each candidate, −1: none.
         indices: node, solid, form, place among the anchors (−1: none) and law (`Laws`) of each candidate of each kind.
         places: of each, among the candidates of all terms, those that ride on the world too; `taken`: how many these are.
         rows: the numbers of each candidate of each kind, `[*, …]` each, as all of these that follow.
@@ -59,7 +61,9 @@ class Candidates:
         laws: of contact between bodies too.
     """
 
+    carriers: Carriers = field(default_factory=Carriers)
     indices: list[list[tuple[int, int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    movers: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     places: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     taken: int = 0
     rows: list[list[Sequence[Tensor]]] = field(default_factory=lambda: [[] for _ in KINDS])
@@ -85,6 +89,11 @@ class Candidates:
     def order(self) -> tuple[int, ...]:
         """The places of all candidates, sorted."""
         return tuple(chain(*self.places))
+
+    @property
+    def carried(self) -> list[int]:
+        """What carries the solid beside each, sorted."""
+        return list(chain(*self.movers))
 
     @property
     def grips(self) -> list[Tensor]:
@@ -124,6 +133,8 @@ class Candidates:
         anchored = isinstance(term.friction, AnchoredFriction)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
         moving = torch.tensor([i for i, node in enumerate(nodes) if node > 0], dtype=torch.long)  # others ride on the world
+        if len(moving) < len(nodes) and _runs(term):
+            raise unknown(f"what does not move against '{name}', which does")
 
         law = Law.of(a, term, f"'{name}'", len(nodes))
         numbers = (term.radius, term.margin, *law.numbers)
@@ -133,7 +144,8 @@ class Candidates:
         self.taken += len(nodes)
         if len(moving) == 0:
             return
-        solid, first = self._solid(a, term, name), self._forms
+        mover = self._mover(term)
+        solid, first = self._solid(a, term, name, mover >= 0), self._forms
         positions, flat = on_nodes(a, term.link, term.position), isinstance(term.surface, Plane)
         rounded = (term.radius > 0).reshape(-1, len(nodes)).any(0).tolist()  # in some world
         if isinstance(term, CurvedContact):
@@ -147,18 +159,19 @@ class Candidates:
                 support, form = (POINT if flat and not rounded[i] else BALL), 0
             kind = KINDS.index((type(term.surface), support))
             self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1, self.laws.number(law, i)))
+            self.movers[kind].append(mover)
             self.places[kind].append(before + i)
             self.rows[kind].append([positions[..., i, :], *(x[..., i, None] for x in numbers)])
 
-    def _solid(self, a: Articulation, term: Contact, name: str) -> int:
-        """Adds what is touched; its number."""
-        surface, carrier = term.surface, term.carrier
-        frame = torch.eye(4, dtype=a.dtype)
-        if carrier is not None:
-            if carrier.motion.moves or any(carrier.motion.belt):
-                raise unknown(f"contact with '{name}', which moves")
-            frame = carrier.start
-        if isinstance(surface, Plane) and carrier is None:
+    def _mover(self, term: Contact) -> int:
+        """The number of what carries the solid; −1: it stands, and so does its surface."""
+        return self.carriers.number(term.carrier) if term.carrier is not None and _runs(term) else -1
+
+    def _solid(self, a: Articulation, term: Contact, name: str, moves: bool) -> int:
+        """Adds what is touched, in its own frame if that moves; its number."""
+        surface = term.surface
+        frame = torch.eye(4, dtype=a.dtype) if moves or term.carrier is None else term.carrier.start
+        if isinstance(surface, Plane) and (moves or term.carrier is None):
             self.planes.append(joined(_one(surface.normal, 1, name), _one(surface.offset, 0, name)))
             return len(self.planes) - 1
         grid, sizes = [0, 0, 0, 0], list[Tensor]()
@@ -199,6 +212,11 @@ class Candidates:
         turn = link_frames(a, term.link)[..., :3, :3]
         axis = (turn @ term.axis[..., None]).squeeze(-1)
         self.forms.append(((turn @ term.form @ turn.mT).flatten(-3), axis.flatten(-2), term.lying.to(term.form.dtype)))
+
+
+def _runs(term: Contact) -> bool:
+    """Whether the solid of a contact moves, or its surface does."""
+    return term.carrier is not None and (term.carrier.motion.moves or any(term.carrier.motion.belt))
 
 
 def _differing(name: str) -> NotCompiledError:

@@ -39,7 +39,8 @@ class _Record(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
         ("given", ctypes.c_void_p * 10),
         ("found", ctypes.c_void_p * 10),
-        *((name, ctypes.c_void_p) for name in ("hazards", "own", *_STATE, *CONTACT, "suspect")),
+        *((name, ctypes.c_void_p) for name in ("hazards", "own", *_STATE, *CONTACT, "suspect", "poses")),
+        ("timed", ctypes.c_int),
     )
 
 
@@ -54,7 +55,7 @@ class Writer(Generic[S]):
         self._calls, self._own = Calls(library, space, threads), space.own
 
     def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
-        """Of steps from the state before the first to those after each `[steps, *batch, …]`, in arrays of this length: the state
+        """Of steps from the state before the first to those after each `[*steps, *batch, …]`, in arrays of this length: the state
         after each, and its contacts if there is a `suspect`; `hazards` are there already."""
         given, found = (self._scheme.fields(x, self._plan) for x in (before, states))
         batch = tuple(before.q.shape[:-1])
@@ -64,6 +65,9 @@ class Writer(Generic[S]):
             asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
         for name, array in arrays.items():
             setattr(asked, name, array.data_ptr())
+        ends = states.time if states.time.ndim > before.time.ndim else states.time[None]
+        poses = self._plan.carriers.poses(torch.cat((before.time[None], ends)))
+        asked.poses, asked.timed = poses.data_ptr(), poses.shape[1]
         own, r = whole(self._own, (*batch, self._own.shape[-1])), self.roster
         asked.own = own.data_ptr()
         real = r.real if r.real.ndim == 1 else whole(r.real, (*batch, r.real.shape[-1]))

@@ -17,6 +17,7 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import Integrator, S, fresh
 from pbfd_torch.integrators.variational import Variational
+from pbfd_torch.native.carriers import passed
 from pbfd_torch.native.core import Core, Journey, Terms
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
@@ -108,8 +109,7 @@ class NativeStepper(Generic[S]):
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
         after each, `[steps, *batch, ...]`, and how each was solved."""
         journey = self._went(state, controls, (steps,))
-        time = torch.cat((state.time[None], self.step_size.expand(steps, *state.time.shape))).cumsum(0)[1:]
-        return self._after(state, journey, time), journey.solution
+        return self._after(state, journey, passed(state.time, self.step_size, steps)[1:]), journey.solution
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
         """The states after steps, and how these were solved."""

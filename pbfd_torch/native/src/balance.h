@@ -6,6 +6,7 @@
 // inertia on the chord, s̄ the twists there, w its share and A with what bends them (inertia.h),
 //   r_i = s̄_i · W,  ∂r_i/∂θ_j = s̄_iᵀ A s_j + w s_j · Y_i.
 #pragma once
+#include "carriers.h"
 #include "contact.h"
 #include "inertia.h"
 #include "joints.h"
@@ -31,6 +32,7 @@ template <class V, class N, int D = 3> struct Balance {
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
   Laws<V, N, D> laws;
+  Carriers<V> carriers;
   Contacts<V, N, D> contacts;
   Meetings<V, N, D> meetings;
 
@@ -38,8 +40,7 @@ template <class V, class N, int D = 3> struct Balance {
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
            in_registers<Push<V, D>>(s.nodes) + Laws<V, N, D>::room(s) + Contacts<V, N, D>::room(s) +
-           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
-           (3 * S + 4 + s.nv) * s.nv + held(s);
+           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
   template <class X> static X* taken(Arena<V>& arena, int count) {
@@ -47,9 +48,11 @@ template <class V, class N, int D = 3> struct Balance {
   }
 
   Balance(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), laws(scene, relaxed, arena), contacts(scene, relaxed, laws, arena), meetings(scene, relaxed, laws, arena) {
+      : plan(scene), laws(scene, relaxed, arena), carriers(scene, arena), contacts(scene, relaxed, laws, carriers, arena),
+        meetings(scene, relaxed, laws, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
+    start.carriers = carriers.start, target.carriers = now.carriers = laws.coasting.carriers = carriers.end;
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
     fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan));

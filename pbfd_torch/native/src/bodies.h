@@ -1,7 +1,8 @@
 // What may touch between bodies: which colliders on which nodes, and what finds them (contact/*_pairs.py). The same for all worlds.
 //
 // A row is a pair of colliders the one of which gives points and the other a solid, so that its two bodies are known: polytopes
-// have two rows, as either may give the points. −1 for a node: the world, in whose axes its frame is then.
+// have two rows, as either may give the points. −1 for a node: the world, in whose axes its frame is then; obstacles that move are
+// counted on after the nodes, and as links.
 // `Bodies` walks once over two arrays that native/plan_bodies.py has written in this order: this file and that one change together.
 #pragma once
 #include "hulls.h"
@@ -31,7 +32,7 @@ constexpr int NUMBERS_OF_A_PAIR = 14;
 // axis [3] on its node, and the same of the other one where it is round; from the 25th on frames [12] of both bodies on their nodes.
 constexpr int OWN_FRAMES = 25, NUMBERS_OF_A_ROW = 49;
 constexpr int NUMBERS_OF_AN_ANCHOR = 7;  // what it is behind by [3], where its point is [3], in the bodies' own frames; its pair
-constexpr int LAWS_OF_A_ROW = 8;       // C⊥, μ, deep, 1/release, 1/width, velocity [3] of a belt in the world: + the solid's, − the points'
+constexpr int LAWS_OF_A_ROW = 8;       // C⊥, μ, deep, 1/release, 1/width, velocity [3] of a belt on its node: + the solid's, − the points'
 
 template <class T> struct Bodies : BodySizes {
   const int* node;         // [links]

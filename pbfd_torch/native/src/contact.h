@@ -1,6 +1,7 @@
-// Contact of candidates with solids at rest: what is known of a step beforehand, the loads at a configuration, and hazards
+// Contact of candidates with solids of the world: what is known of a step beforehand, the loads at a configuration, and hazards
 // (terms/contact.py, contact/hazards.py).
 #pragma once
+#include "carriers.h"
 #include "kinds.h"
 #include "touching.h"
 
@@ -9,11 +10,13 @@ namespace pbfd {
 template <class V, class N, int D> struct Contacts {
   using Scalar = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
+  static constexpr int T = turns(D);
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
   const V* grip = nullptr;  // μ [candidates] of the worlds in the lanes
   const Relaxed<V>& relaxed;
   const Laws<V, N, D>& laws;
+  Carriers<V>& carriers;
   // what is fixed in a step
   const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
   Poses<V> before;  // of the nodes at its start
@@ -25,12 +28,14 @@ template <class V, class N, int D> struct Contacts {
   Poses<V> now;
   V *turned_by, *rollings;  // [T], [T × T]
   bool* turned;
+  V carried_turn[T], carried_rolling[T * T];  // likewise of the node `turning`, seen from the solid that `turned_on` carries
+  int turning, turned_on;
 
   static int room(Sizes s) {
     return (3 + D) * s.candidates + s.uncommon + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Arena<V>& arena)
-      : plan(scene), candidates(scene.contact), relaxed(easier), laws(all) {
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Carriers<V>& moving, Arena<V>& arena)
+      : plan(scene), candidates(scene.contact), relaxed(easier), laws(all), carriers(moving) {
     share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     bounce = arena.take(plan.uncommon);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
@@ -40,17 +45,17 @@ template <class V, class N, int D> struct Contacts {
   // The step begins at these poses, and would lead to `free` without contacts. `anew`: which lanes begin it.
   void begin(M anew, Poses<V> start, Poses<V> free, V step) {
     before = start, per_dt = V(1) / step;
+    if constexpr (D == 3) carriers.begin(plan.belt, step);
     each_kind(candidates, [&](auto pair, int first, int last) {
       using Surface = typename decltype(pair)::Surface;
       using Support = typename decltype(pair)::Support;
       if (!Surface::convex && !Support::wanders) return;
       for (int i = first; i < last; i++) {
-        V c[D];
+        V c[D], room[D * D];
         Beside<V, D> solid;
-        center(i, before, c);
-        Surface::beside(candidates, i, c, solid);
-        if constexpr (Support::wanders)
-          share[i] = Support::share(candidates, i, before.rotation + D * D * candidates.carrier[i], solid.normal);
+        origin(i, c);
+        beside<Surface>(i, c, solid);
+        if constexpr (Support::wanders) share[i] = Support::share(candidates, i, stood(i, room), solid.normal);
         if constexpr (Surface::convex) keep_outside(i, c, solid, free);
       }
     });
@@ -83,6 +88,7 @@ template <class V, class N, int D> struct Contacts {
   void look(Poses<V> poses) {
     now = poses;
     for (int k = 0; k < plan.nodes; k++) turned[k] = false;
+    turning = -1;
   }
 
   // Adds the loads of what touches.
@@ -142,8 +148,7 @@ template <class V, class N, int D> struct Contacts {
       for (int i = first; i < last; i++) {
         V c[D], push, rises;
         Beside<V, D> solid;
-        center(i, before, c);
-        const V start = depth(pair, i, before, c, solid);
+        const V start = began(pair, i, c, solid);
         center(i, at, c);
         V firmness = V(candidates.firmness[i]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
@@ -162,31 +167,82 @@ template <class V, class N, int D> struct Contacts {
     for (int j = 0; j < D; j++) out[j] += at.position[D * k + j];
   }
 
+  // What carries the solid beside a candidate; −1: it stands, and so does its surface.
+  int mover(int i) const { return D == 3 && plan.moving > 0 ? plan.mover[i] : -1; }
+
+  // Where a candidate was at the start, and how its body stood [D × D], as the solid has carried them by the end of the step.
+  void origin(int i, V* c) const {
+    center(i, before, c);
+    if constexpr (D == 3)
+      if (const int m = mover(i); m >= 0) carriers.carry(m, c);
+  }
+  const V* stood(int i, V* room) const {
+    const V* R = before.rotation + D * D * candidates.carrier[i];
+    const int m = mover(i);
+    if (m < 0) return R;
+    if constexpr (D == 3) carriers.carry_rotation(m, R, room);
+    return room;
+  }
+
+  // What a point is beside, of a solid as it is at the end of the step.
+  template <class Surface> void beside(int i, const V* c, Beside<V, D>& solid) const {
+    const int m = mover(i);
+    if (m < 0) return Surface::beside(candidates, i, c, solid);
+    if constexpr (D == 3) {
+      V own[3], n[3];
+      carriers.to_own(m, c, own);
+      Surface::beside(candidates, i, own, solid);
+      for (int j = 0; j < 3; j++) n[j] = solid.normal[j];
+      carriers.turn(m, n, solid.normal);
+    }
+  }
+  template <class Surface> void bend(int i, const V* c, const Beside<V, D>& solid, V* out) const {
+    const int m = mover(i);
+    if (Surface::flat || m < 0) return Surface::bend(candidates, i, c, solid, out);
+    if constexpr (D == 3) {
+      Beside<V, 3> seen = solid;
+      V own[3], bent[9], half[9];
+      carriers.to_own(m, c, own), carriers.turn_back(m, solid.normal, seen.normal);
+      Surface::bend(candidates, i, own, seen, bent);
+      product(carriers.end + 12 * m, bent, half), product_transposed(half, carriers.end + 12 * m, out);
+    }
+  }
+
   template <class Pair> V depth(Pair, int i, Poses<V> at, const V* c, Beside<V, D>& solid) const {
-    Pair::Surface::beside(candidates, i, c, solid);
+    return depth(Pair(), i, at.rotation + D * D * candidates.carrier[i], c, solid);
+  }
+  // At the start, and where that was.
+  template <class Pair> V began(Pair, int i, V* c, Beside<V, D>& solid) const {
+    V room[D * D];
+    origin(i, c);
+    if constexpr (Pair::Support::wanders) return depth(Pair(), i, stood(i, room), c, solid);
+    return depth(Pair(), i, before, c, solid);
+  }
+  template <class Pair> V depth(Pair, int i, const V* R, const V* c, Beside<V, D>& solid) const {
+    beside<typename Pair::Surface>(i, c, solid);
     if constexpr (Pair::Surface::convex) {
       const V* plane = guard + (2 + D) * i;
       const M stands = plane[0] > V(0);
       solid.distance = select(stands, dot<D>(plane + 1, c) - plane[1 + D], solid.distance);
       for (int j = 0; j < D; j++) solid.normal[j] = select(stands, plane[1 + j], solid.normal[j]);
     }
-    return sunk(Pair(), i, at, solid);
+    return sunk(Pair(), i, R, solid);
   }
   // How deep it is beside what is known of a solid.
-  template <class Pair> V sunk(Pair, int i, Poses<V> at, const Beside<V, D>& solid) const {
-    const V reach = Pair::Support::reach(candidates, i, at.rotation + D * D * candidates.carrier[i], solid.normal);
+  template <class Pair> V sunk(Pair, int i, const V* R, const Beside<V, D>& solid) const {
+    const V reach = Pair::Support::reach(candidates, i, R, solid.normal);
     return reach + V(candidates.margin[i]) - solid.distance;
   }
 
   // What its normal force stores where the nodes are: C d^(α+1)/(α+1) (Eq. 9), of the solid itself.
   template <class Pair> V stored(Pair, int i) const {
+    const V* R = now.rotation + D * D * candidates.carrier[i];
     V c[D], firmness = V(candidates.firmness[i]);
     Beside<V, D> solid;
     center(i, now, c);
-    Pair::Surface::beside(candidates, i, c, solid);
-    if constexpr (Pair::Support::wanders)
-      firmness = firmness * Pair::Support::share(candidates, i, now.rotation + D * D * candidates.carrier[i], solid.normal);
-    const V d = max(sunk(Pair(), i, now, solid), V(0));
+    beside<typename Pair::Surface>(i, c, solid);
+    if constexpr (Pair::Support::wanders) firmness = firmness * Pair::Support::share(candidates, i, R, solid.normal);
+    const V d = max(sunk(Pair(), i, R, solid), V(0));
     const Law<V>* law = laws.at(candidates.law[i]);
     if (!squared(law)) return firmness * power(d, law->exponent + Scalar(1)) / V(law->exponent + Scalar(1));
     return V(1) / V(3) * firmness * d * d * d;
@@ -197,16 +253,16 @@ template <class V, class N, int D> struct Contacts {
     const int k = candidates.carrier[i];
     V c[D];
     Beside<V, D> solid;
-    center(i, before, c);
-    t.start = depth(Pair(), i, before, c, solid);
+    t.start = began(Pair(), i, c, solid);
     for (int j = 0; j < D; j++) t.moved[j] = t.center[j] - c[j];
     if constexpr (D == 3)
       if (anchored(i)) {
         V stretched[3];
         Pair::Surface::to_world(candidates, i, behind + 3 * candidates.anchor[i], stretched);
+        if (const int m = mover(i); m >= 0) carriers.turn(m, stretched, stretched);
         for (int j = 0; j < 3; j++) t.moved[j] += stretched[j];
       }
-    Pair::Surface::bend(candidates, i, t.center, t.solid, t.bend);
+    bend<typename Pair::Surface>(i, t.center, t.solid, t.bend);
     if constexpr (Pair::Surface::convex)
       for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
@@ -217,13 +273,12 @@ template <class V, class N, int D> struct Contacts {
     if (laws.throwing) t.firmness = harder(i, t.firmness);
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
+    if (const int m = mover(i); m >= 0) return turn_beside(k, m, t);
     if (!turned[k]) turn(k);
     t.turn = turned_by + T * k, t.rolling = rollings + T * T * k;
   }
 
  private:
-  static constexpr int T = turns(D);
-
   // Scenes with anchors are seen in space.
   bool anchored(int i) const { return D == 3 && candidates.anchor[i] >= 0; }
 
@@ -243,6 +298,7 @@ template <class V, class N, int D> struct Contacts {
     t.template slip<typename Pair::Support>(w);
     const V part = V(1) / max(V(candidates.per_width[i]) * sqrt(dot<D>(w, w)), V(1));
     for (int j = 0; j < D; j++) w[j] = select(holds, part * w[j], V(0));
+    if (const int m = mover(i); m >= 0) carriers.turn_back(m, w, w);
     Pair::Surface::to_own(candidates, i, w, kept);
   }
 
@@ -250,6 +306,19 @@ template <class V, class N, int D> struct Contacts {
     rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turned_by + T * k);
     log_jacobian<D>(turned_by + T * k, V(-0.5), rollings + T * T * k);
     turned[k] = true;
+  }
+
+  // As a solid sees it that is carried along itself.
+  [[gnu::noinline]] void turn_beside(int k, int m, Touching<V, D>& t) {
+    if constexpr (D == 3)
+      if (turning != k || turned_on != m) {
+        V began[9];
+        carriers.carry_rotation(m, before.rotation + 9 * k, began);
+        rotation_between(now.rotation + 9 * k, began, carried_turn);
+        log_jacobian(carried_turn, V(-0.5), carried_rolling);
+        turning = k, turned_on = m;
+      }
+    t.turn = carried_turn, t.rolling = carried_rolling;
   }
 
   // A point that moves far in one step ends beyond the solid, where its distance knows nothing of what lies between: a plane that

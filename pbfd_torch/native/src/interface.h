@@ -24,6 +24,7 @@ struct pbfd_plan {
   int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0, remembered = 0;
   const int* body_whole = nullptr;
   const void* body_real = nullptr;
+  int moving = 0;  // obstacles in prescribed motion, in space only
 };
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
@@ -48,6 +49,10 @@ struct pbfd_steps {
   int* fallbacks;
   const void* own;   // [worlds, varied] the worlds' own numbers
   void* trial[7];    // of starts: room for what their trial is given but q, and for what it finds, of `Positions`
+  // where the obstacles that move are at the ends of all parts of all steps, [2^halvings · steps + 1, timed, moving, 12], see
+  // `Timetable`; timed: 1, or all worlds
+  const void* poses = nullptr;
+  int timed = 1;
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.
@@ -94,6 +99,8 @@ struct pbfd_record {
   void *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;
   void *contact_depth, *contact_point, *contact_normal, *contact_force, *contact_slip;
   int* suspect;
+  const void* poses = nullptr;  // as of pbfd_steps, at the ends of all steps, [steps + 1, …]
+  int timed = 1;
 };
 
 PBFD_FUNCTION void pbfd_energy_momentum_record(const pbfd_plan*, const pbfd_roster*, const pbfd_record*, void* room);

@@ -22,12 +22,17 @@ namespace {
 Sizes sizes(const pbfd_plan* p) {
   const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
   return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
-          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}};
+          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}, p->moving};
 }
 
-template <class T> Journey<T> journey(const pbfd_steps* s, const void* const* given, void* const* found) {
+template <class T, class A> Timetable<T> timetable(const pbfd_plan* p, const A* asked) {
+  return {static_cast<const T*>(asked->poses), asked->timed, p->moving};
+}
+
+template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, const void* const* given, void* const* found) {
   return {s->worlds, s->steps, s->held != 0, given, static_cast<const T*>(s->control), found,
-          static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks};
+          static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks,
+          timetable<T>(p, s)};
 }
 
 Rules rules(const pbfd_plan* p, const pbfd_steps* s) {
@@ -76,7 +81,7 @@ template <template <class, class, int> class Scheme> struct Going {
                    Arena<V>& arena) {
     Machine<V, N, D, Scheme<V, N, D>> machine(plan, own, arena);
     machine.newton.balance.contacts.grip = grip;
-    machine.run(journey<typename Kind<V>::Scalar>(s, s->given, s->found), rules(p, s), s->first, s->last);
+    machine.run(journey<typename Kind<V>::Scalar>(p, s, s->given, s->found), rules(p, s), s->first, s->last);
   }
 };
 
@@ -92,7 +97,7 @@ template <template <class, class, int> class Scheme> struct Starting {
     Rules trial = rules(p, s);
     trial.share = 1;
     const T* speeds = static_cast<const T*>(s->given[1]);
-    starts.run(journey<T>(s, before, s->trial + 3), trial, s->trial, speeds, s->found, s->first, s->last);
+    starts.run(journey<T>(p, s, before, s->trial + 3), trial, s->trial, speeds, s->found, s->first, s->last);
   }
 };
 
@@ -103,7 +108,8 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
     for (int w = s->first; w < s->last; w++) {
       own.load(0, w);
       inspect(plan, plan.remembered() ? row(s->given[9], w, plan.remembered()) : nullptr, row(s->given[0], w, p->nq),
-              row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt), arena,
+              row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt),
+              timetable<T>(p, s).at(0, w), timetable<T>(p, s).at(1 << p->halvings, w), arena,
               static_cast<T*>(residual) + long(w) * p->nv, static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
     }
   });
@@ -132,13 +138,13 @@ template <class What> void make_by(const pbfd_plan* p, const pbfd_steps* s, void
 
 template <template <class, class, int> class Scheme> struct Recording {
   template <class V, class N>
-  static void make(const pbfd_roster* r, const pbfd_record* a, const Plan<N, 3>& plan, Numbers<V>& own, const V* grip,
+  static void make(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, const Plan<N, 3>& plan, Numbers<V>& own, const V* grip,
                    Arena<V>& arena) {
     using T = typename Kind<V>::Scalar;
     auto out = [](void* array) { return static_cast<T*>(array); };
     const Roster<T> roster{r->links, r->slots, r->first_limit, r->own != 0,
                            r->carrier, r->slot, r->danger, r->meeting_slot, r->meeting_danger, static_cast<const T*>(r->real)};
-    const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, out(a->q), out(a->v), out(a->link_poses),
+    const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, timetable<T>(p, a), out(a->q), out(a->v), out(a->link_poses),
                            out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
                            out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
                            out(a->contact_force), out(a->contact_slip), a->suspect};
@@ -152,7 +158,7 @@ template <template <class, class, int> class Scheme, class T>
 void record_of(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   using V = Lanes<T, register_bytes / int(sizeof(T))>;
   with_several<V, 3, apart<Scheme>>(p, a->own, {static_cast<V*>(room)}, [&](auto& plan, auto& own, auto* grip, auto& arena) {
-    Recording<Scheme>::make(r, a, plan, own, grip, arena);
+    Recording<Scheme>::make(p, r, a, plan, own, grip, arena);
   });
 }
 

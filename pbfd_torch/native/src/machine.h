@@ -18,6 +18,7 @@ template <class T> struct Journey {
   void* const* found;
   T* residual_norm;
   int *status, *evaluations, *iterations, *hazards, *fallbacks;
+  Timetable<T> timetable;
 };
 
 template <class V, class N, int D, class Scheme> struct Machine {
@@ -42,6 +43,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
     newton.balance.recall(before.behind);
+    sight.there.carriers = newton.balance.now.carriers;
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
   }
 
@@ -100,6 +102,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
 
   // What a lane is to solve next. Most have just made a step, and are to make one.
   void pose(int i) {
+    if (plan.moving > 0) move_obstacles(i);
     const bool plain = trips[i].first() && ways[i].way == DIRECTLY;
     if (plain && plainly[i]) return;
     plainly[i] = plain;
@@ -116,6 +119,14 @@ template <class V, class N, int D, class Scheme> struct Machine {
     put(newton.most, i, T(ways[i].most(trips[i].led() ? DIRECT : SOON)));
     put(safe, i, start == GUESS_OR_RETREAT), put(from_guess, i, start == GUESS_OR_RETREAT || start == GUESS);
     put(from_start, i, start == BEGINNING);
+  }
+
+  // They go from where they are when it begins to where they are when it ends.
+  void move_obstacles(int i) {
+    const Timetable<T>& table = journey->timetable;
+    const int from = world[i] < 0 ? end - 1 : world[i];
+    const long lasts = (1 << plan.halvings) >> trips[i].halvings, begins = (long(step[i]) << plan.halvings) + trips[i].part * lasts;
+    newton.balance.carriers.load(i, table.at(begins, from), table.at(begins + lasts, from));
   }
 
   // Lanes are served together: what it costs to end a step is the same for one lane and for all.

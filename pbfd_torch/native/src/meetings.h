@@ -93,8 +93,8 @@ template <class V, class N, int D> struct Meetings {
         pbfd::press<Pair::Surface::flat, typename Pair::Support>(t, sums[r]);
       });
       if (!sums[r].any) return;
-      if (const int k = bodies.first[r]; k >= 0) pushes[k].add(sums[r]);
-      if (const int k = bodies.second[r]; k >= 0) push_back(sums[r], pushes[k]);
+      if (const int k = slots.on_tree(bodies.first[r]); k >= 0) pushes[k].add(sums[r]);
+      if (const int k = slots.on_tree(bodies.second[r]); k >= 0) push_back(sums[r], pushes[k]);
     });
   }
 
@@ -102,7 +102,7 @@ template <class V, class N, int D> struct Meetings {
   void couple(const V* axes, V* matrix) const {
     if constexpr (D == 3)
       for (int k = 0; k < slots.active; k++) {
-        const int r = slots.rows[k], a = bodies.first[r], b = bodies.second[r];
+        const int r = slots.rows[k], a = slots.on_tree(bodies.first[r]), b = slots.on_tree(bodies.second[r]);
         if (!sums[r].any || a < 0 || b < 0) continue;
         V there[36], back[36], turned[36], moved[36];
         turning(sums[r], turned, moved);
@@ -150,7 +150,7 @@ template <class V, class N, int D> struct Meetings {
   // Of a row whose bodies have turned by more than a quarter turn in the step.
   M turned_far(int r) const {
     M found(false);
-    for (int k : {bodies.first[r], bodies.second[r]}) {
+    for (int k : {slots.on_tree(bodies.first[r]), slots.on_tree(bodies.second[r])}) {
       if (k < 0) continue;
       V traced(0);
       for (int j = 0; j < 9; j++) traced = fma(now.rotation[9 * k + j], slots.before.rotation[9 * k + j], traced);

@@ -126,10 +126,11 @@ template <class V, class N, int D = 3> struct Outlook {
     at.holding = meetings.holding(spot, held);
     V v[3], a[3], v_other[3], a_other[3], w[3], spin[3];
     const V *c = at.center, *n = at.solid.normal;
-    move(meetings.bodies.first[r], c, v, a), move(meetings.bodies.second[r], c, v_other, a_other);
+    const int first = meetings.slots.on_tree(meetings.bodies.first[r]), second = meetings.slots.on_tree(meetings.bodies.second[r]);
+    move(first, c, v, a), move(second, c, v_other, a_other);
     for (int j = 0; j < 3; j++) {
-      w[j] = meetings.bodies.second[r] < 0 ? zero : V(-2) * twist[S * meetings.bodies.second[r] + j];
-      spin[j] = (meetings.bodies.first[r] < 0 ? zero : twist[S * meetings.bodies.first[r] + j]) + V(0.5) * w[j];
+      w[j] = second < 0 ? zero : V(-2) * twist[S * second + j];
+      spin[j] = (first < 0 ? zero : twist[S * first + j]) + V(0.5) * w[j];
       v[j] -= v_other[j], a[j] -= a_other[j];
     }
     add_cross(w, v, a);  // Coriolis: seen from a turning body

@@ -12,6 +12,7 @@ template <class T> struct Record {
   int worlds;
   const void *const *given, *const *found;
   const int* hazards;
+  Timetable<T> timetable;
   T *q, *v, *link_poses, *center_of_mass, *kinetic_energy, *potential_energy, *linear_momentum, *angular_momentum;
   T *depth, *point, *normal, *force, *slip;
   int* suspect;
@@ -81,6 +82,8 @@ template <class V, class N, class Scheme> struct Recorder {
   void load(int i, int step) {
     world[i] = step % record->worlds;
     if (own.varied) own.load(i, world[i]);
+    if (const long k = step / record->worlds; plan.moving > 0)
+      balance.carriers.load(i, record->timetable.at(k, world[i]), record->timetable.at(k + 1, world[i]));
     const bool begins = step < record->worlds;
     const long earlier = begins ? step : step - record->worlds;
     int k = 0;

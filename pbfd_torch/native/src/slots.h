@@ -32,12 +32,12 @@ template <class V, class N, int D> struct Slots {
     const BodySizes& b = s.bodies;
     if (D != 3 || b.rows == 0) return 0;
     return b.groups * b.links + in(int(sizeof(Spot<V>)) * SPOTS * b.rows) + in(int(sizeof(int)) * ints(b)) +
-           in(int(sizeof(T)) * Finder<T>::room(b, s.nodes)) + in(Coupling::bytes(s.nodes, s.nv));
+           in(int(sizeof(T)) * Finder<T>::room(b, s.nodes + s.moving)) + in(Coupling::bytes(s.nodes, s.nv));
   }
   static int ints(const BodySizes& b) { return b.rows * (2 + W) + W * (b.groups + b.slots); }
 
   Slots(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), bodies(scene.pairing), finder(bodies, there(scene) ? plan.nodes : 0, scalars(arena)),
+      : plan(scene), bodies(scene.pairing), finder(bodies, there(scene) ? plan.nodes + plan.moving : 0, scalars(arena)),
         coupling(there(scene) ? plan.nodes : 0, plan.nv, there(scene) ? bytes(arena, Coupling::bytes(plan.nodes, plan.nv)) : nullptr) {
     active = 0, dropped = V(0);
     for (int i = 0; i < 12; i++) still[i] = V(T(i < 9 && i % 4 == 0));
@@ -62,8 +62,14 @@ template <class V, class N, int D> struct Slots {
       for (int j = 0; j < most[rows[k]]; j++) begin(rows[k], spot[SPOTS * rows[k] + j], dt);
   }
 
-  const V* rotation(Poses<V> at, int node) const { return node < 0 ? still : at.rotation + 9 * node; }
-  const V* position(Poses<V> at, int node) const { return node < 0 ? still + 9 : at.position + 3 * node; }
+  // A node that joints move, or −1.
+  int on_tree(int node) const { return node < plan.nodes ? node : -1; }
+  const V* rotation(Poses<V> at, int node) const {
+    return node < 0 ? still : node < plan.nodes ? at.rotation + 9 * node : at.carriers + 12 * (node - plan.nodes);
+  }
+  const V* position(Poses<V> at, int node) const {
+    return node < 0 ? still + 9 : node < plan.nodes ? at.position + 3 * node : at.carriers + 12 * (node - plan.nodes) + 9;
+  }
   // A point as the body of a row's solid sees it.
   void seen(int row, Poses<V> at, const V* x, V* out) const {
     const V* p = position(at, bodies.second[row]);
@@ -122,11 +128,11 @@ template <class V, class N, int D> struct Slots {
     if (k < 0) return V(0);
     V turn[9], moved[9], shift[3];
     const T* frame = bodies.frame + 12 * link;
-    for (int j = 0; j < 9; j++) turn[j] = to.rotation[9 * k + j] - from.rotation[9 * k + j];
+    for (int j = 0; j < 9; j++) turn[j] = rotation(to, k)[j] - rotation(from, k)[j];
     product(turn, frame, moved), times(turn, frame + 9, shift);
     V chord(0);
     for (int j = 0; j < 9; j++) chord = fma(moved[j], moved[j], chord);
-    for (int j = 0; j < 3; j++) shift[j] += to.position[3 * k + j] - from.position[3 * k + j];
+    for (int j = 0; j < 3; j++) shift[j] += position(to, k)[j] - position(from, k)[j];
     return fma(V(bodies.extent[group * bodies.links + link]), sqrt(V(0.5) * chord), sqrt(dot(shift, shift)));
   }
 
@@ -134,11 +140,11 @@ template <class V, class N, int D> struct Slots {
   static bool there(const Plan<N, D>& plan) { return D == 3 && plan.bodies.rows > 0; }
   static char* bytes(Arena<V>& arena, int size) { return reinterpret_cast<char*>(arena.take(in(size))); }
   T* scalars(Arena<V>& arena) const {
-    return there(plan) ? reinterpret_cast<T*>(bytes(arena, int(sizeof(T)) * Finder<T>::room(bodies, plan.nodes))) : nullptr;
+    return there(plan) ? reinterpret_cast<T*>(bytes(arena, int(sizeof(T)) * Finder<T>::room(bodies, plan.nodes + plan.moving))) : nullptr;
   }
 
   void find(int i, Poses<V> start, Poses<V> free, bool sorted) {
-    for (int k = 0; k < plan.nodes; k++) copy(start, k, i, finder.start[k]), copy(free, k, i, finder.ahead[k]);
+    for (int k = 0; k < plan.nodes + plan.moving; k++) copy(start, k, i, finder.start[k]), copy(free, k, i, finder.ahead[k]);
     for (int g = 0; g < bodies.groups; g++)
       for (int c = 0; c < found[W * g + i]; c++) {  // what it had
         const int at = *slot(g, i, c);
@@ -179,9 +185,9 @@ template <class V, class N, int D> struct Slots {
     times(frames + 12, kept, anchor);
     for (int j = 0; j < 3; j++) put(s.anchor[j], i, anchor[j]);
   }
-  static void copy(Poses<V> from, int k, int i, Pose<T>& to) {
-    for (int j = 0; j < 9; j++) to.rotation[j] = lane(from.rotation[9 * k + j], i);
-    for (int j = 0; j < 3; j++) to.position[j] = lane(from.position[3 * k + j], i);
+  void copy(Poses<V> from, int k, int i, Pose<T>& to) const {
+    for (int j = 0; j < 9; j++) to.rotation[j] = lane(rotation(from, k)[j], i);
+    for (int j = 0; j < 3; j++) to.position[j] = lane(position(from, k)[j], i);
   }
 
   // A lane's candidate in a place of its row; which.
@@ -210,7 +216,7 @@ template <class V, class N, int D> struct Slots {
       for (int i = 0; i < W; i++) most[r] = most[r] > count[W * r + i] ? most[r] : count[W * r + i];
       if (most[r] == 0) continue;
       rows[active++] = r;
-      const int a = bodies.first[r], b = bodies.second[r];
+      const int a = on_tree(bodies.first[r]), b = on_tree(bodies.second[r]);
       if (a >= 0 && b >= 0) wanted[plan.nodes * (a > b ? a : b) + (a > b ? b : a)] = true;
     }
     changed = coupling.renew(plan) || changed;
@@ -218,9 +224,11 @@ template <class V, class N, int D> struct Slots {
 
   // Where it is at the start, as the solid's body sees it.
   void begin(int row, Spot<V>& s, V dt) {
-    V c[3], ran[3], belt[3];
+    V c[3], ran[3], own[3], belt[3];
     center(row, s, before, c), seen(row, before, c, s.start);
-    for (int j = 0; j < 3; j++) belt[j] = V(laws(row)[5 + j]);
+    const int runs = bodies.first[row] >= plan.nodes ? bodies.first[row] : bodies.second[row];  // that of an obstacle
+    for (int j = 0; j < 3; j++) own[j] = V(laws(row)[5 + j]);
+    times(runs >= plan.nodes ? rotation(before, runs) : still, own, belt);
     transposed_times(rotation(before, bodies.second[row]), belt, ran);
     s.began = bodies.meeting[row] < CURVED ? depth(row, s, s.start) : curved_depth(row, s, c);
     for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);

@@ -52,6 +52,8 @@ template <class V, class N, int D, class Scheme> struct Starts {
     balance.dt = dt, balance.relaxed.none(), balance.recall(before.behind);
     each_block(first, last, [&] {
       take(q, plan.nq, before.q), take(speeds, plan.nv, v), take(back, plan.nq, before.q_previous);
+      for (int i = 0; plan.moving > 0 && i < W; i++)
+        balance.carriers.load(i, trial.timetable.at(0, world(i)), trial.timetable.at(1 << plan.halvings, world(i)));
       take(static_cast<const T*>(trial.found[0]), plan.nq, end), take(trial.control, plan.nu, balance.control);
       M solved;
       for (int i = 0; i < W; i++) put(solved, i, trial.status[world(i)] <= HALVED);

@@ -5,9 +5,10 @@
 
 namespace pbfd {
 
-// Poses of all nodes: rotation [D × D] and position [D] each.
+// Poses of all nodes: rotation [D × D] and position [D] each; and of the obstacles that move, as they are then.
 template <class V> struct Poses {
   V *rotation, *position;
+  const V* carriers = nullptr;  // [12] each
   template <int D = 3> static Poses in(Arena<V>& arena, Sizes s) { return {arena.take(D * D * s.nodes), arena.take(D * s.nodes)}; }
 };
 
