@@ -58,8 +58,8 @@ def pile(
     return Scene(articulation, (Inertia(), *terms), gravity, colliders, tuple(obstacles))
 
 
-def thrown_together(scene: Scene, worlds: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Configurations in which free bodies lie about the arm, and velocities."""
+def thrown_together(scene: Scene, worlds: int, seed: int = 0, spread: float = 0.25) -> tuple[Tensor, Tensor]:
+    """Configurations in which free bodies lie about the arm, within `spread` [m], and velocities."""
     a = scene.articulation
     random = torch.Generator().manual_seed(seed)
 
@@ -69,7 +69,7 @@ def thrown_together(scene: Scene, worlds: int, seed: int = 0) -> tuple[Tensor, T
     q, v = a.rest.repeat(worlds, 1), 0.5 * drawn(worlds, a.nv)
     for first, size in zip(a.topology.q_start, a.topology.joint_sizes, strict=True):
         if size == (7, 6):
-            q[:, first : first + 3] = 0.25 * drawn(worlds, 3) + a.rest.new_tensor([0.2, 0.0, 0.3])
+            q[:, first : first + 3] = spread * drawn(worlds, 3) + a.rest.new_tensor([0.2, 0.0, 0.05 + spread])
             q[:, first + 3 : first + 7] = quaternion_exp(1.5 * drawn(worlds, 3))
         elif size == (4, 3):
             q[:, first : first + 4] = quaternion_exp(0.5 * drawn(worlds, 3))

@@ -33,7 +33,6 @@ from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.terms.static_friction import StaticFriction
 from pbfd_torch.tree.kinematics import place
 from tests.native_parity import DT, compared, require_balance, resting
 from tests.test_native_contact import (
@@ -349,6 +348,10 @@ def test_rollouts_record_what_the_engine_in_pytorch_records() -> None:
             assert torch.allclose(getattr(records[0], name).double(), values.double(), rtol=1e-6, atol=1e-6), name
 
 
+class OwnFriction(CoulombFriction):
+    """A user's own, which the core cannot know."""
+
+
 def test_what_is_not_covered_is_said() -> None:
     """Other laws, and capsules that lie askew in their own frames, in which anchors are told."""
     scene = touching(BALLS, (SOLIDS["capsule"],))
@@ -357,7 +360,7 @@ def test_what_is_not_covered_is_said() -> None:
     assert isinstance(contact.surface, SegmentSurface)
     skew = dataclasses.replace(contact.surface, start=contact.surface.start + 0.01)
     for changes, words in (
-        ({"friction": StaticFriction(0.5, 0.4)}, "StaticFriction"),
+        ({"friction": OwnFriction(0.5)}, "OwnFriction"),
         ({"friction": AnchoredFriction(0.5), "surface": skew}, "anchors on 'pill', a capsule that does not lie along z"),
     ):
         other = dataclasses.replace(scene, terms=(scene.terms[0], dataclasses.replace(contact, **changes)))

@@ -29,7 +29,6 @@ from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
 from tests.native_parity import DT, gaps, require_balance, require_starts, require_steps, resting
@@ -74,9 +73,7 @@ def touching(shapes: Sequence[Shape], solids: Sequence[Solid], kind: Any = Conta
     return Scene(a, tuple(terms), torch.tensor([0.3, 0.0, -9.81], dtype=dtype))
 
 
-def beside(
-    scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3, time: Tensor | None = None
-) -> tuple[Velocities, Tensor]:
+def beside(scene: Scene, worlds: int, seed: int = 0, speed: float = 0.3, time: Tensor | None = None) -> tuple[Velocities, Tensor]:
     """Random states, and configurations at which a step of theirs may end, with one candidate at the surface of one solid: up to
     a centimetre deeper or less. speed: standard deviation [m/s, rad/s]; time: of the states `[worlds]` [s]."""
     random = torch.Generator().manual_seed(seed)
@@ -134,16 +131,15 @@ def test_friction_of_each_world() -> None:
 
 
 @pytest.mark.parametrize(
-    ("law", "solid", "restitution", "words"),
+    ("law", "solid", "words"),
     [
-        (NormalForce(1e5, exponent=1.5), GROUND, None, "normal force on 'ground' with another exponent than 2"),
-        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), None, "contact with 'hull', which is a ConvexSurface"),
-        (NormalForce(1e5), GROUND, Restitution(0.5), "restitution"),
+        (NormalForce(1e5).seen_from(1e-3), GROUND, "normal force on 'ground', a DistantForce"),
+        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), "contact with 'hull', which is a ConvexSurface"),
     ],
 )
-def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, restitution: Restitution | None, words: str) -> None:
+def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, words: str) -> None:
     a = two_links()
-    contact = Contact.between(a, [Collider("c", "second", Sphere(0.1))], solid, law, CoulombFriction(0.7), restitution)
+    contact = Contact.between(a, [Collider("c", "second", Sphere(0.1))], solid, law, CoulombFriction(0.7))
     scene = Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
     assert uncovered(Simulator(scene, DT).eager) == f"the core does not know {words}"
 

@@ -29,6 +29,7 @@ from pbfd_torch.records.recording import Recorder
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -63,7 +64,9 @@ def recorded(simulator: Simulator[Any], state: State, controls: Tensor | None, s
     states, solution = stepper.run(state, controls, steps)
     record = stepper.record(state, steps)
     record.add(state, states, solution)
-    return record.finish(), defined(simulator, state, controls, states, solution)
+    pair = record.finish(), defined(simulator, state, controls, states, solution)
+    between = any(isinstance(term, BodyContact) for term in simulator.scene.terms)
+    return (in_order(simulator.scene, pair[0]), in_order(simulator.scene, pair[1])) if between else pair
 
 
 def defined(simulator: Simulator[Any], state: State, controls: Tensor | None, states: State, solution: Solution) -> Rollout:
@@ -76,16 +79,44 @@ def defined(simulator: Simulator[Any], state: State, controls: Tensor | None, st
     return record.finish()
 
 
-def require_same(found: Rollout, expected: Rollout) -> None:
-    """To rounding, NaN where there is NaN."""
-    for name in set(ARRAYS) - {"lanes"}:
+KEYS = (0.541, 0.273, 0.119, 0.913, 0.377, 0.229, 0.067)  # of a point, a normal and a depth
+
+
+def in_order(scene: Scene, rollout: Rollout) -> Rollout:
+    """With contacts between bodies in an order that rounding does not change: their slots are filled nearest first, and several
+    may be as near."""
+    sizes = [len(x.link) if isinstance(x, Contact) else x.finder.slots for x in scene.terms if isinstance(x, Contact | BodyContact)]
+    between = [isinstance(x, BodyContact) for x in scene.terms if isinstance(x, Contact | BodyContact)]
+    each = torch.cat((rollout.contact_point, rollout.contact_normal, rollout.contact_depth[..., None]), -1)
+    keys = (each @ each.new_tensor(KEYS)).split(sizes, -1)
+    order, first = [], 0
+    for key, size, sorted_ in zip(keys, sizes, between, strict=True):
+        order.append(first + (key.argsort(dim=-1) if sorted_ else torch.arange(size).expand_as(key)))
+        first += size
+    places = torch.cat(order, -1)
+    arrays = {name: getattr(rollout, name) for name in ARRAYS if name.startswith("contact_")}
+    put = {name: x.take_along_dim(places.reshape(*places.shape, *(1,) * (x.ndim - 3)), 2) for name, x in arrays.items()}
+    return replace(rollout, **put)
+
+
+def require_same(found: Rollout, expected: Rollout, ties: float = 0.0) -> None:
+    """To rounding, NaN where there is NaN; contacts may differ in this share of the steps of all worlds: of bodies that overlap
+    deep several points are as far from those that are kept."""
+    alike = torch.ones_like(found.status, dtype=torch.bool)
+    contacts = [name for name in ARRAYS if name.startswith("contact_")]
+    for name in [*contacts, *(set(ARRAYS) - {"lanes", *contacts})]:
         ours, theirs = getattr(found, name), getattr(expected, name)
         assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype), name
         if theirs.dtype.is_floating_point and theirs.numel():
             size = max(1.0, float(theirs.nan_to_num(0.0).abs().max()))
-            assert torch.allclose(ours, theirs, 0.0, FELT.get(name, ROUNDING) * size, equal_nan=True), name
+            same = torch.isclose(ours, theirs, 0.0, FELT.get(name, ROUNDING) * size, equal_nan=True)
         else:
-            assert torch.equal(ours, theirs), name
+            same = ours == theirs
+        if ties and name in contacts:
+            alike &= same.flatten(2).all(-1)
+        else:
+            assert bool((same | ~alike if name == "suspect" else same).all()), name
+    assert int((~alike).sum()) <= ties * alike.numel()
     assert (found.dangers, found.link_names) == (expected.dangers, expected.link_names)
 
 
@@ -104,7 +135,8 @@ def test_named_scenes(name: str, integrator: Integrator[Any]) -> None:
     """In a plane and in space; eased and halved steps among them."""
     setup = SCENES[name](worlds=11) if name in SCENES else file_setup(ROBOTS / name, worlds=11)
     simulator, state, controls = started(setup, 0.01, integrator, 25)
-    require_same(*recorded(simulator, state, controls, 25))
+    between = any(isinstance(term, BodyContact) for term in setup.scene.terms)
+    require_same(*recorded(simulator, state, controls, 25), ties=0.01 if between else 0.0)
 
 
 def test_steps_that_are_eased_halved_or_not_solved() -> None:

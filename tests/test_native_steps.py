@@ -155,7 +155,6 @@ def test_a_plane_is_space_with_less(name: str, tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize(
     ("name", "changes", "words"),
     [
-        ("stack", {}, "BodyContact"),
         ("hopper", {"integrator": OwnScheme()}, "integrator OwnScheme"),
     ],
 )

@@ -45,7 +45,7 @@ class ClosestPairs(Finder):
         gap, table, body = gap.squeeze(-1), self.table.take(which), self.body[which]
         frames = bodies[..., None, :, :3, :].take_along_dim(body[..., None, None], -3)
         both, plane = table.met(frames, Sought(gap, normal, height, filled))
-        follows = ~table.held(gap, moves.gather(-1, which))
+        follows = filled & ~table.held(gap, moves.gather(-1, which))
         return CurvedSlots(
             filled=filled,
             pair=self.pair[which],

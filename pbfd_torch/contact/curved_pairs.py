@@ -163,7 +163,7 @@ class CurvedPairs(PolytopePairs):
             frames = self.frame[torch.stack((shape, plane[rows]), -1)][..., :3, :]
             both = Swept(meeting.both.centers[rows], meeting.both.forms[rows], meeting.both.lines[rows]).moved(frames)
             both = Swept(shaped(both.centers), shaped(both.forms), shaped(both.lines))
-            meeting = Meeting(both, shaped(meeting.follows[rows] & (spot == POINTS + RIMS)))
+            meeting = Meeting(both, shaped(meeting.follows[rows] & (spot == POINTS + RIMS) & filled.reshape(spot.shape)))
         return self._curved(slots, shaped(form), shaped(turn[..., 2]), shaped(lying), meeting)
 
     def _empty_points(self, slots: Slots) -> CurvedSlots:

@@ -24,11 +24,11 @@ class _Plan(ctypes.Structure):
             (name, ctypes.c_int)
             for name in (
                 *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
-                *("candidates", "anchors", "planes", "solids", "samples", "forms", "pushes", "varied"),
+                *("candidates", "anchors", "planes", "solids", "samples", "forms", "uncommon", "pushes", "varied"),
             )
         ),
         *((name, ctypes.c_void_p) for name in ("whole", "real", "sample", "which")),
-        *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots")),
+        *((name, ctypes.c_int) for name in ("links", "groups", "rows", "pairs", "colliders", "slots", "remembered")),
         *((name, ctypes.c_void_p) for name in ("body_whole", "body_real")),
         ("moving", ctypes.c_int),
     )

@@ -136,7 +136,7 @@ class Core:
 
     def _empty(self, scheme: Scheme, q: Tensor) -> dict[str, Tensor]:
         """Room for the fields of a state of worlds at q `[*batch, nq]`, its memory among them."""
-        shapes = scheme.shapes(self.plan) | {"memory": (sum(self.plan.anchors), 3)}
+        shapes = scheme.shapes(self.plan) | {"memory": (self.plan.remembered,)}
         return {name: q.new_empty((*q.shape[:-1], *shape)) for name, shape in shapes.items()}
 
     def _poses(self, time: Tensor, steps: int) -> Tensor:

@@ -27,6 +27,7 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.curved_body_contact import CurvedBodyContact
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
@@ -36,7 +37,7 @@ from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
-CONTACTS = (Contact, CurvedContact, BodyContact)
+CONTACTS = (Contact, CurvedContact, BodyContact, CurvedBodyContact)
 TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Pushes, *CONTACTS)
 
 
@@ -46,8 +47,8 @@ class Plan:
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
     μ: the core knows these in space only, and not with BDF2. carriers: of the obstacles that move. order: where the candidates are
-    among those of all contact terms. anchors: how many each contact has, in the order of a state's memory. seats: where links are
-    on the nodes."""
+    among those of all contact terms. memory: of each term that remembers, in the order of a state's memory, where it begins among
+    all numbers that are remembered, and its shape; remembered: how many these are. seats: where links are on the nodes."""
 
     sizes: tuple[int, ...]
     whole: Tensor
@@ -60,7 +61,8 @@ class Plan:
     apart: bool
     carriers: Carriers
     order: tuple[int, ...]
-    anchors: tuple[int, ...]
+    memory: tuple[tuple[int, int, int], ...]
+    remembered: int
     seats: Seats
 
     def take(self, worlds: Worlds) -> Plan:
@@ -114,14 +116,15 @@ class _Parts:
     joints: Sequence[Tensor]
     scene: Sequence[Tensor]
     pushes: Sequence[Tensor]
+    memory: tuple[tuple[int, int, int], ...]
     dimension: int = 3
 
     @property
     def real(self) -> list[Tensor]:
         """All numbers."""
         nodes = (x.flatten(-rank) for x, rank in zip(self.nodes, (3, 2, 1, 1, 1, 2, 3, 1), strict=True))
-        touching = [*self.candidates.real(), *self.pushes, *self.bodies.laws, *self.carriers.belts]
-        return [*nodes, *self.joints, self.gravity, *self.scene, *touching]
+        laws = [*self.bodies.laws, *self.candidates.laws.real(), *self.carriers.belts]
+        return [*nodes, *self.joints, self.gravity, *self.scene, *self.candidates.real(), *self.pushes, *laws]
 
     @property
     def apart(self) -> bool:
@@ -140,7 +143,7 @@ class _Parts:
         sizes = zip(t.joint_sizes, t.joint_is_hinge, strict=True)
         kinds = [int(not hinge) if size == (1, 1) else KINDS[size] for size, hinge in sizes]
         whole = [parent - 1 for parent in t.joint_parent] + kinds + [*t.q_start, *t.v_start]
-        whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed
+        whole += _plain(self.nodes[0]) + _above(a) + self.driven + candidates.whole() + self.pushed + candidates.laws.manners
         whole += candidates.carried if len(self.carriers) else []
         real, which, own = _told_apart(self.real)
         return Plan(
@@ -155,7 +158,8 @@ class _Parts:
             dimension=self.dimension,
             apart=self.apart,
             order=candidates.order,
-            anchors=tuple(candidates.anchors),
+            memory=self.memory,
+            remembered=3 * sum(candidates.anchors) + self.bodies.remembered,
             seats=Seats.of(a),
         )
 
@@ -177,7 +181,7 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
-        bodies=Bodies.of(a, known.meetings, known.carriers),
+        bodies=(bodies := Bodies.of(a, known.meetings, known.carriers, known.candidates.laws, 3 * sum(known.candidates.anchors))),
         carriers=known.carriers,
         driven=driven,
         pushed=known.pushed,
@@ -185,7 +189,23 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         joints=joints,
         scene=[reach(a)[..., None], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
         pushes=[x[k].flatten(-2) for k in range(2) for x in known.pushes],
+        memory=_memory(stepper.terms, known.candidates.anchors, bodies),
     )
+
+
+def _memory(terms: Sequence[Any], anchors: Sequence[int], bodies: Bodies) -> tuple[tuple[int, int, int], ...]:
+    """See `Plan`."""
+    found, contacts, meetings = [], iter(anchors), iter(zip(bodies.memory, bodies.kept, strict=True))
+    taken = 0
+    for term in terms:
+        if isinstance(term, BodyContact):
+            first, count = next(meetings)
+            found.append((max(first, 0), count if first >= 0 else 0, 7))
+        elif isinstance(term, Contact):
+            count = next(contacts)
+            found.append((taken, count, 3))
+            taken += 3 * count
+    return tuple(found)
 
 
 def _told_apart(pieces: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:

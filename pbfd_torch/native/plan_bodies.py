@@ -11,20 +11,26 @@ from torch import Tensor
 
 from pbfd_torch.contact.ball_pairs import BallBoxPairs, BallCylinderPairs, BallPairs
 from pbfd_torch.contact.candidates import Finder
+from pbfd_torch.contact.closest_pairs import ClosestPairs
+from pbfd_torch.contact.curved_pairs import CurvedPairs
 from pbfd_torch.contact.hazards import Overflow
 from pbfd_torch.contact.polytope import Polytope
 from pbfd_torch.contact.polytope_pairs import PolytopePairs
 from pbfd_torch.contact.round_pairs import RoundPairs
 from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import unknown
-from pbfd_torch.native.plan_contact import along, laws_of
+from pbfd_torch.native.plan_contact import along
+from pbfd_torch.native.plan_curved import round_pair, round_table, row_of, shape_row
 from pbfd_torch.native.plan_hulls import hulls
+from pbfd_torch.native.plan_laws import Law, Laws
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What the points of a row meet, and what finds them, as src/bodies.h has them.
-CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM = range(5)
-ROUND, BALL, POLYTOPE = range(3)
+CORNER_ON_FACE, BALL_ON_FACE, BALL_ON_PILL, BALL_ON_BLOCK, BALL_ON_DRUM, RIM_ON_FACE, ROUND_ON_ROUND = range(7)
+ROUND, BALL, POLYTOPE, CURVED, CLOSEST = range(5)
+NUMBERS_OF_A_PAIR, OWN_FRAMES = 14, 25
 
 
 @dataclass
@@ -36,10 +42,11 @@ class Bodies:
             of their own after all others. links: how many bodies are links.
         moving: the bodies that move, links first.
         kept, finders, ends: of each term how many candidates it keeps, what finds them, and how many pairs there are up to it.
-        rows: of each its nodes, what meets what, its term and the place of its pair; sizes: its numbers, `[17]`; laws: `[*, 8]`.
+        rows: of each its nodes, what meets what, its term, the place of its pair and its law (`Laws`); sizes: its numbers, `[49]`;
+            laws: `[*, 8]`.
         pairs: of each its first row, its colliders, whether these are boxes, and its links; numbers: `[14]`.
         colliders: node and link of each; places: its frame there, `[12]`; polytopes.
-        extents, slack: of each term.
+        extents, slack: of each term. memory: where what its anchors remember begins, −1: it has none; remembered: how much in all.
     """
 
     frames: Tensor
@@ -49,7 +56,7 @@ class Bodies:
     kept: list[int] = field(default_factory=list)
     finders: list[int] = field(default_factory=list)
     ends: list[int] = field(default_factory=lambda: [0])
-    rows: list[tuple[int, int, int, int, int]] = field(default_factory=list)
+    rows: list[tuple[int, int, int, int, int, int]] = field(default_factory=list)
     sizes: list[Tensor] = field(default_factory=list)
     laws: list[Tensor] = field(default_factory=list)
     pairs: list[tuple[int, int, int, int, int, int]] = field(default_factory=list)
@@ -59,10 +66,13 @@ class Bodies:
     polytopes: list[Polytope] = field(default_factory=list)
     extents: list[Tensor] = field(default_factory=list)
     slack: list[float] = field(default_factory=list)
+    memory: list[int] = field(default_factory=list)
+    remembered: int = 0
 
     @classmethod
-    def of(cls, a: Articulation, terms: Sequence[BodyContact], carriers: Carriers) -> Bodies:
-        """Of the terms of a scene, whose obstacles that move are added to the carriers. Raises `NotCompiledError`."""
+    def of(cls, a: Articulation, terms: Sequence[BodyContact], carriers: Carriers, laws: Laws, before: int) -> Bodies:
+        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws, and what carries
+        their obstacles. Raises `NotCompiledError`."""
         frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
         obstacles = list(terms[0].obstacles) if terms else []
         eye = torch.eye(4, dtype=a.dtype)
@@ -73,15 +83,16 @@ class Bodies:
         moving = [*range(len(nodes)), *(len(nodes) + k for k, seat in enumerate(seats) if seat >= 0)]
         bodies = cls(torch.cat((frames, *(x[None] for x in starts))), [*nodes, *seats], len(nodes), moving)
         for term in terms:
-            bodies._take(a, term)
+            bodies._take(a, term, laws, before)
         return bodies
 
     @property
     def size(self) -> tuple[int, ...]:
-        """Of src/interface.h: links, groups, rows, pairs, colliders, slots."""
+        """Of src/interface.h: links, groups, rows, pairs, colliders, slots, remembered."""
         if not self.rows:
-            return 0, 0, 0, 0, 0, 0
-        return len(self.moving), len(self.kept), len(self.rows), len(self.pairs), len(self.colliders), sum(self.kept)
+            return 0, 0, 0, 0, 0, 0, 0
+        counts = len(self.kept), len(self.rows), len(self.pairs), len(self.colliders)
+        return len(self.moving), *counts, sum(self.kept), self.remembered
 
     @property
     def whole(self) -> list[int]:
@@ -91,7 +102,7 @@ class Bodies:
         tables = [*zip(*self.rows, strict=True), *zip(*(x[:4] for x in self.pairs), strict=True)]
         links = itertools.chain(*(x[4:] for x in self.pairs))
         colliders = zip(*self.colliders, strict=True)
-        whole = [*(self.nodes[x] for x in self.moving), *self.kept, *self.finders, *self.ends]
+        whole = [*(self.nodes[x] for x in self.moving), *self.kept, *self.finders, *self.ends, *self.memory]
         return [*whole, *itertools.chain(*tables), *links, *itertools.chain(*colliders), *self._hulls[0]]
 
     @property
@@ -108,20 +119,24 @@ class Bodies:
     def _hulls(self) -> tuple[list[int], Tensor]:
         return hulls(self.polytopes)
 
-    def _take(self, a: Articulation, term: BodyContact) -> None:
+    def _take(self, a: Articulation, term: BodyContact, laws: Laws, before: int) -> None:
         """Adds a term."""
         if term.overflow is not Overflow.FLAG:
             raise unknown(f"overflow {term.overflow.name} of contact between bodies")
-        laws = laws_of(a, term, "bodies", len(term.pairs))
+        law = Law.of(a, term, "bodies", len(term.pairs))
         group = len(self.kept)
         for first, second, kind, size, place in self._rows(term.finder):
-            self.rows.append((self.nodes[first], self.nodes[second], kind, group, place))
-            self.sizes.append(torch.nn.functional.pad(size, (0, 17 - len(size))))
+            self.rows.append((self.nodes[first], self.nodes[second], kind, group, place, laws.number(law, place)))
+            frames = (_flat(self.frames[first]), _flat(self.frames[second]))
+            self.sizes.append(torch.cat((torch.nn.functional.pad(size, (0, OWN_FRAMES - len(size))), *frames)))
             belt = self._belt(term, second) - self._belt(term, first)
-            some = [x[..., place, None] for x in laws]
+            some = [x[..., place, None] for x in law.numbers]
             batch = torch.broadcast_shapes(*(x.shape[:-1] for x in some))
             self.laws.append(torch.cat([x.expand(*batch, x.shape[-1]) for x in (*some, belt)], -1))
         self.kept.append(term.finder.slots)
+        anchored = isinstance(term.friction, AnchoredFriction)
+        self.memory.append(before + self.remembered if anchored else -1)
+        self.remembered += 7 * term.finder.slots if anchored else 0
         self.ends.append(len(self.pairs))
         self.extents.append(term.extent[self.moving])
         self.slack.append(term.slack)
@@ -140,8 +155,11 @@ class Bodies:
         elif isinstance(finder, BallPairs):
             self.finders.append(BALL)
             yield from self._balls(finder)
-        elif type(finder) is PolytopePairs:
-            self.finders.append(POLYTOPE)
+        elif isinstance(finder, ClosestPairs):
+            self.finders.append(CLOSEST)
+            yield from self._closest(finder)
+        elif isinstance(finder, PolytopePairs):
+            self.finders.append(CURVED if isinstance(finder, CurvedPairs) else POLYTOPE)
             yield from self._polytopes(finder)
         else:
             raise unknown(type(finder).__name__)
@@ -150,7 +168,7 @@ class Bodies:
         """Adds one of bodies a and b."""
         one, other = (self._number(x) for x in (a, b))
         self.pairs.append((row, *colliders, int(boxes), one, other))
-        self.numbers.append(torch.nn.functional.pad(numbers, (0, 14 - len(numbers))))
+        self.numbers.append(torch.nn.functional.pad(numbers, (0, NUMBERS_OF_A_PAIR - len(numbers))))
 
     def _number(self, body: int) -> int:
         """Which of those that move a body is, −1: it does not."""
@@ -185,13 +203,37 @@ class Bodies:
             self.colliders.append((self.nodes[body], self._number(body)))
             self.places.append(_flat(self.frames[body] @ frame))
         self.polytopes += finder.polytopes
-        radius = finder.table.radius
+        table, curved = finder.table, isinstance(finder, CurvedPairs)
+        radius = table.radius
         tables = (finder.pair.tolist(), finder.first.tolist(), finder.second.tolist(), finder.boxes.tolist())
         for place, one, other, boxes in zip(*tables, strict=True):
             a, b = bodies[one], bodies[other]
-            self._pair(len(self.rows), a, b, radius.new_empty(0), (before + one, before + other), boxes)
+            met, turned = round_table(finder, one, other) or (None, False) if curved else (None, False)
+            numbers = radius.new_empty(0) if met is None else round_pair(met, 0, self._frames(a, b, turned), turned)
+            self._pair(len(self.rows), a, b, numbers, (before + one, before + other), boxes)
             for points, first, second in ((one, a, b), (other, b, a)):
-                yield first, second, BALL_ON_FACE if radius[points] > 0 else CORNER_ON_FACE, radius[points, None], place
+                if not table.curved[points] and (met is None or turned is (points == one)):
+                    kind = BALL_ON_FACE if radius[points] > 0 else CORNER_ON_FACE
+                    yield first, second, kind, radius[points, None], place
+                    continue
+                size = torch.cat((radius[points, None], shape_row(finder, points, self.frames[first])))
+                if met is None or turned is (points == one):
+                    yield first, second, RIM_ON_FACE, size, place
+                else:
+                    ours = row_of(met.shapes.forms[0], met.shapes.lines[0], self._frames(first, second))
+                    yield first, second, ROUND_ON_ROUND, torch.cat((size, ours[12:])), place
+
+    def _closest(self, finder: ClosestPairs) -> Iterator[tuple[int, int, int, Tensor, int]]:
+        shapes = finder.table.shapes
+        for k, (place, (a, b)) in enumerate(zip(finder.pair.tolist(), finder.body.tolist(), strict=True)):
+            frames = self._frames(a, b)
+            self._pair(len(self.rows), a, b, round_pair(finder.table, k, frames, turned=False))
+            size = row_of(shapes.forms[k], shapes.lines[k], frames)
+            yield a, b, ROUND_ON_ROUND, torch.nn.functional.pad(size, (1, 0)), place
+
+    def _frames(self, a: int, b: int, turned: bool = False) -> Tensor:
+        """Where two bodies are on their nodes, `[2, 4, 4]`."""
+        return self.frames[[b, a] if turned else [a, b]]
 
     def _placed(self, body: int, points: Tensor) -> Tensor:
         """Points of a body on its node, `[n, 3]`."""

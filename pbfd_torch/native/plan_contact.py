@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,14 +15,11 @@ from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSu
 from pbfd_torch.contact.surface import Plane
 from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
+from pbfd_torch.native.plan_laws import Law, Laws
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
-from pbfd_torch.terms.contact_laws import ContactLaws
-from pbfd_torch.terms.coulomb_friction import CoulombFriction, DryFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
-from pbfd_torch.terms.friction_law import FrictionLaw
-from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What touches what, as `each_kind` in src/kinds.h has it: candidates are sorted by these.
@@ -55,17 +51,18 @@ class Candidates:
 
     Attributes:
         carriers: of the obstacles that move; movers: which of them carries the solid of each candidate, −1: none.
-        indices: node, solid, form and place among the anchors (−1: none) of each candidate of each kind.
+        indices: node, solid, form, place among the anchors (−1: none) and law (`Laws`) of each candidate of each kind.
         places: of each, among the candidates of all terms, those that ride on the world too; `taken`: how many these are.
         rows: the numbers of each candidate of each kind, `[*, …]` each, as all of these that follow.
         planes: `[*, 4]`. grids: where the samples of a solid begin, and how many there are along each axis. solids: frame, sizes
             and thickness. forms: M, axis and `lying` of some, side by side.
         samples: of all grids, `[n]`.
         anchors: how many each contact has: none, or one for each candidate, those of links that ride on the world too.
+        laws: of contact between bodies too.
     """
 
     carriers: Carriers = field(default_factory=Carriers)
-    indices: list[list[tuple[int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
+    indices: list[list[tuple[int, int, int, int, int]]] = field(default_factory=lambda: [[] for _ in KINDS])
     movers: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     places: list[list[int]] = field(default_factory=lambda: [[] for _ in KINDS])
     taken: int = 0
@@ -76,13 +73,17 @@ class Candidates:
     forms: list[Sequence[Tensor]] = field(default_factory=list)
     samples: list[Tensor] = field(default_factory=list)
     anchors: list[int] = field(default_factory=list)
+    laws: Laws = field(default_factory=Laws)
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Of src/candidates.h: candidates, anchors, planes, solids, samples, forms."""
-        forms = sum(len(lying) for _, _, lying in self.forms)
-        samples = sum(map(len, self.samples))
-        return sum(map(len, self.indices)), sum(self.anchors), len(self.planes), len(self.solids), samples, forms
+        """Of src/candidates.h: candidates, anchors, planes, solids, samples, forms, uncommon laws."""
+        samples, laws = sum(map(len, self.samples)), len(self.laws.manners)
+        return sum(map(len, self.indices)), sum(self.anchors), len(self.planes), len(self.solids), samples, self._forms, laws
+
+    @property
+    def _forms(self) -> int:
+        return sum(len(lying) for _, _, lying in self.forms)
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -135,7 +136,8 @@ class Candidates:
         if len(moving) < len(nodes) and _runs(term):
             raise unknown(f"what does not move against '{name}', which does")
 
-        numbers = (term.radius, term.margin, *laws_of(a, term, f"'{name}'", len(nodes)))
+        law = Law.of(a, term, f"'{name}'", len(nodes))
+        numbers = (term.radius, term.margin, *law.numbers)
         anchor = sum(self.anchors)
         self.anchors.append(len(nodes) if anchored else 0)
         before = self.taken
@@ -143,7 +145,7 @@ class Candidates:
         if len(moving) == 0:
             return
         mover = self._mover(term)
-        solid, first = self._solid(a, term, name, mover >= 0), self.sizes[-1]
+        solid, first = self._solid(a, term, name, mover >= 0), self._forms
         positions, flat = on_nodes(a, term.link, term.position), isinstance(term.surface, Plane)
         rounded = (term.radius > 0).reshape(-1, len(nodes)).any(0).tolist()  # in some world
         if isinstance(term, CurvedContact):
@@ -156,7 +158,7 @@ class Candidates:
             else:
                 support, form = (POINT if flat and not rounded[i] else BALL), 0
             kind = KINDS.index((type(term.surface), support))
-            self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1))
+            self.indices[kind].append((nodes[i] - 1, solid, form, anchor + i if anchored else -1, self.laws.number(law, i)))
             self.movers[kind].append(mover)
             self.places[kind].append(before + i)
             self.rows[kind].append([positions[..., i, :], *(x[..., i, None] for x in numbers)])
@@ -212,31 +214,6 @@ class Candidates:
         self.forms.append(((turn @ term.form @ turn.mT).flatten(-3), axis.flatten(-2), term.lying.to(term.form.dtype)))
 
 
-def laws_of(a: Articulation, term: ContactLaws[Any], name: str, count: int) -> Sequence[Tensor]:
-    """C⊥, μ, from which depth on it is a hazard [m], one over the release speed [s/m] and one over what friction is smooth below,
-    a slip speed [s/m] or the stretch of an anchor [1/m], of so many candidates or pairs, `[*, n]` each. Raises `NotCompiledError`
-    for other laws."""
-    law, friction = term.normal_force, term.friction
-    if type(law) is not NormalForce or law.exponent != 2.0:
-        raise unknown(f"normal force on {name} with another exponent than 2")
-    width = _width(friction)
-    if term.restitution is not None:
-        raise unknown("restitution")
-
-    def each(value: float | Tensor | None, other: float) -> Tensor:
-        number = torch.as_tensor(other if value is None else value, dtype=a.dtype)
-        return number.expand(*number.shape[:-1], count)
-
-    mu, grip = friction.mu if isinstance(friction, DryFriction) else 0.0, getattr(term, "grip", None)
-    return (
-        each(law.stiffness, 0.0) * each(term.firm, 1.0),
-        each(mu if grip is None else mu * grip, 0.0),
-        each(term.deep, torch.finfo(a.dtype).max),
-        1.0 / each(law.release, 0.0),
-        1.0 / each(width, 1.0),
-    )
-
-
 def _runs(term: Contact) -> bool:
     """Whether the solid of a contact moves, or its surface does."""
     return term.carrier is not None and (term.carrier.motion.moves or any(term.carrier.motion.belt))
@@ -244,17 +221,6 @@ def _runs(term: Contact) -> bool:
 
 def _differing(name: str) -> NotCompiledError:
     return unknown(f"contact with '{name}' of its own for each candidate")
-
-
-def _width(friction: FrictionLaw | None) -> float:
-    """What friction is smooth below: a slip speed [m/s], or the stretch of an anchor [m]; 1 without friction."""
-    if friction is None:
-        return 1.0
-    if type(friction) is CoulombFriction:
-        return friction.slip_speed
-    if type(friction) is AnchoredFriction:
-        return friction.stretch
-    raise unknown(type(friction).__name__)
 
 
 def _one(value: Tensor, rank: int, name: str) -> Tensor:

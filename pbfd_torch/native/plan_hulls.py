@@ -49,13 +49,23 @@ def _numbers(polytope: Polytope, rings: list[list[int]]) -> NDArray[np.float64]:
     vertices, rim = polytope.vertices, polytope.rim
     size = 0.5 * float(np.linalg.norm(np.ptp(vertices, axis=0))) + polytope.radius
     form, half = ((*rim.form,), rim.half) if rim else ((0.0, 0.0, 0.0), 0.0)
-    alone = np.array([polytope.radius, size, polytope.thickness, *form, half, *vertices.max(0), *vertices.mean(0), 0.0])
+    sizes = polytope.radius, size, polytope.thickness
+    alone = np.array([*sizes, *form, half, *vertices.max(0), *vertices.mean(0), _bulge(polytope)])
     start, end = (vertices[polytope.edges[:, k]] for k in (0, 1))
     along = end - start
     length = np.linalg.norm(along, axis=1, keepdims=True)
     unit = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
     edges = np.concatenate((unit, *_beside(polytope, rings)), 1)
     return np.concatenate([x.reshape(-1) for x in (alone, vertices, polytope.planes, edges)]).astype(np.float64)
+
+
+def _bulge(polytope: Polytope) -> float:
+    """How far a curved shape goes beyond the polytope that stands for it, at most [m]."""
+    if polytope.rim is None:
+        return 0.0
+    normals, offsets = polytope.planes[:, :3], polytope.planes[:, 3]
+    reach = np.sqrt(normals**2 @ np.array(polytope.rim.form)) + polytope.rim.half * np.abs(normals[:, 2])
+    return float((reach - offsets).max())
 
 
 def _beside(polytope: Polytope, rings: list[list[int]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -112,7 +112,8 @@ class _Still:
                     values = getattr(points, name.removeprefix("contact_"))  # all slips are zero
                     parts[name].append(values.movedim(-1 - len(event), 0)[here].movedim(0, -1 - len(event)))
                 force, depth = parts["contact_force"][-1], parts["contact_depth"][-1]
-                self.energy = self.energy + (torch.linalg.vector_norm(force, dim=-1) * depth.clamp_min(0)).sum(-1) / 3
+                work = (torch.linalg.vector_norm(force, dim=-1) * depth.clamp_min(0)).sum(-1)
+                self.energy = self.energy + work / (term.normal_force.exponent + 1)
                 turned = torch.zeros(a.topology.nlink, dtype=torch.bool)
                 shares.append(term.strain(prepared, step.previous, turned)[0][..., here])
             self.slots += [first + i for i in here]

@@ -43,8 +43,9 @@ class Scheme:
         batch = tuple(state.q.shape[:-1])
         given = self._inward(state, plan)
         given = {name: whole(x, batch if self.widths[name] == NUMBER else (*batch, x.shape[-1])) for name, x in given.items()}
-        if any(plan.anchors):
-            given["memory"] = whole(torch.cat(state.memory, -2), (*batch, sum(plan.anchors), 3))
+        if plan.remembered:
+            parts = sorted(zip(plan.memory, state.memory, strict=True), key=lambda x: x[0][0])
+            given["memory"] = whole(torch.cat([x.flatten(-2) for _, x in parts], -1), (*batch, plan.remembered))
         return given
 
     def restored(self, found: dict[str, Tensor], plan: Plan) -> dict[str, Any]:

@@ -119,10 +119,11 @@ class NativeStepper(Generic[S]):
 
     def _after(self, state: S, journey: Journey, time: Tensor) -> S:
         """The states after steps from a state, at these times."""
-        anchors, found = self._core.plan.anchors, self._scheme.restored(journey.found, self._core.plan)
-        memory = state.memory
-        if any(anchors):
-            memory = found["memory"].split(anchors, -2)
+        plan = self._core.plan
+        found, memory = self._scheme.restored(journey.found, plan), state.memory
+        if plan.remembered:
+            whole = found["memory"]
+            memory = tuple(whole[..., first : first + n * width].unflatten(-1, (n, width)) for first, n, width in plan.memory)
         elif time.ndim > state.time.ndim:  # there is nothing in it
             memory = tuple(x.expand(len(time), *x.shape) for x in memory)
         return replaced(state, **found | {"time": time, "hazards": journey.counted["hazards"], "memory": memory})
@@ -130,7 +131,7 @@ class NativeStepper(Generic[S]):
     def complete(self, state: S) -> S:
         """With zero for an acceleration that is not known, and anchors where there is nothing in the memory yet."""
         batch = state.q.shape[:-1]
-        if any(self._core.plan.anchors) and not state.memory:
+        if self._core.plan.remembered and not state.memory:
             state = replaced(state, memory=blank_memory(self.eager.terms, batch))
         if not isinstance(state, Positions) or state.acceleration is not None:
             return state

@@ -68,7 +68,7 @@ class CurvedBodyContact(BodyContact):
         bodies = prepared.standing(placement)
         first = of_slots(bodies, slots.first)
         form = _form(slots, first)
-        deep = dataclasses.replace(at, depth=at.depth + reaching(form, at.normal))
+        deep = dataclasses.replace(at, depth=torch.where(slots.filled, at.depth + reaching(form, at.normal), at.depth))
         balls = torch.diag_embed(slots.radius.square()[..., None].expand(*slots.radius.shape, 3))
         planes = Supported.of(deep, form + balls)
         if slots.meeting is None:

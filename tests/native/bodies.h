@@ -38,6 +38,7 @@ struct Scene {
     for (int kind = 0; kind < pbfd::Candidates<double, 3>::KINDS; kind++) whole.push_back(kind == (b.radius > 0) ? candidates : 0);
     whole.insert(whole.end(), 3 * candidates, 0);  // all on node 0, all against plane 0
     for (int i = 0; i < candidates; i++) whole.push_back(b.anchored ? i : -1);
+    whole.insert(whole.end(), candidates, -1);  // by the usual law
     add({1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, b.mass, 0, 0, 0});
     add({sum - b.inertia[0], 0, 0, 0, sum - b.inertia[1], 0, 0, 0, sum - b.inertia[2], b.mass});
     const double weight = b.mass * G, reach = 0.1;
@@ -48,7 +49,7 @@ struct Scene {
     add({0, 0, -G, reach, 1, 0, 1e-3});
     real.insert(real.end(), b.positions.begin(), b.positions.end());
     all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(1 / 0.1), all(b.anchored ? 1 / 1e-4 : 1 / 1e-3), add({0, 0, 1, 0});
-    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, 0, whole.data(), real.data(), nullptr, nullptr};
+    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, 0, 0, whole.data(), real.data(), nullptr, nullptr};
     CHECK(pbfd_whole_numbers(&plan) == long(whole.size()));
     CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   }

@@ -15,21 +15,39 @@ namespace {
 constexpr double DT = 0.01, MASS = 1.0, SECOND = 0.01, INF = std::numeric_limits<double>::infinity();
 constexpr int NQ = 7, NV = 6, WORLDS = 11, KINDS = Candidates<double, 3>::KINDS, CELLS = 9;
 
+// The usual law, anchors, and all uncommon manners, some with another exponent.
+struct Holding {
+  bool anchored, uncommon;
+  int manner;
+  double mu, particulars[PARTICULARS];
+};
+const Holding HOLDINGS[] = {{false, false, 0, 0.5, {}},
+                            {true, false, 0, 0.5, {}},
+                            {false, true, COULOMB, 0.5, {1.5, 0, 0, 0, 0}},
+                            {true, true, COULOMB, 0.5, {2.5, 0, 0, 0, 0}},
+                            {false, true, STATIC, 0.5, {2, 0, 0, 0.4, 1 / 0.05}},
+                            {false, true, PAPER, 1e6, {2, 1, 1, 0, 0}},
+                            {false, true, PAPER, 3e6, {1.7, 0.6, 1.3, 0, 0}},
+                            {false, true, GRADIENT, 1e5, {2, 0, 1, 0, 0}},
+                            {false, true, GRADIENT, 1e6, {2, 0.5, 1.4, 0, 0}}};
+
 // A free body at z = 1.2 or so that touches a solid whose top is at z = 1, by a candidate of one kind.
 struct Scene {
   std::vector<int> whole;
   std::vector<double> real, heights;
   Sizes sizes;
 
-  Scene(int kind, bool anchored) {
+  Scene(int kind, const Holding& how) {
+    const bool anchored = how.anchored;
     const bool plane = kind < 3, rim = kind == 2 || kind >= 9;  // see kinds.h
     const int solid = plane ? -1 : kind < 9 ? kind - 3 : kind - 5, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
     whole = {-1, FREE, 0, 0, 1, 0, 1, 2, 3, 4, 5};  // how many dofs each dof rides on, and which
     for (int i = 0; i < NV; i++)
       for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);
     for (int k = 0; k < KINDS; k++) whole.push_back(k == kind);
-    whole.insert(whole.end(), {0, 0, 0, anchored ? 0 : -1});  // carrier, solid, form, anchor
+    whole.insert(whole.end(), {0, 0, 0, anchored ? 0 : -1, how.uncommon - 1});  // carrier, solid, form, anchor, law
     if (!plane) whole.insert(whole.end(), {0, CELLS, CELLS, solid == 5 ? CELLS : 1});
+    if (how.uncommon) whole.push_back(how.manner);
     real = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, MASS, 0.01, 0, 0.02, SECOND, 0, 0, 0, SECOND, 0, 0, 0, 2 * SECOND, MASS};
     auto each = [&](double straight, double turning) {
       for (int i = 0; i < NV; i++) real.push_back(i < 3 ? straight : turning);
@@ -39,7 +57,7 @@ struct Scene {
     each(-INF, -INF), each(INF, INF), each(0, 0);
     real.insert(real.end(), {0, 0, 0, 1, 0, 0, 0});
     real.insert(real.end(), {0, 0, -9.81, 0.2, 1, 0, 1e-3});
-    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, 0.5, 0.01, 1 / 0.3, anchored ? 1 / 1e-3 : 1 / 1e-2});
+    real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, how.mu, 0.01, 1 / 0.3, anchored ? 1 / 1e-3 : 1 / 1e-2});
     if (plane) real.insert(real.end(), {0, 0, 1, 1});
     if (!plane) {
       real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == 4 ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
@@ -50,7 +68,8 @@ struct Scene {
         heights.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
     }
     if (rim) real.insert(real.end(), {0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.03, 0, 1, 0, 0});
-    sizes = {{1, anchored, plane, !plane, samples, rim}, 1, NQ, NV, 0, 0, 0};
+    if (how.uncommon) real.insert(real.end(), how.particulars, how.particulars + PARTICULARS);
+    sizes = {{1, anchored, plane, !plane, samples, rim, how.uncommon}, 1, NQ, NV, 0, 0, 0};
     CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));
     CHECK(Plan<double>::real_numbers(sizes) == int(real.size()));
   }
@@ -80,8 +99,8 @@ void start(double* q, int world, double height) {
   quaternion_exp(turn, q + 3);
 }
 
-void of_kind(int kind, bool anchored) {
-  const Scene scene(kind, anchored);
+void of_kind(int kind, const Holding& how) {
+  const Scene scene(kind, how);
   const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data(), scene.heights.data());
   const double height = scene.sizes.forms ? 1.15 : 1.17;
   using V = Lanes<double, 4>;
@@ -130,6 +149,12 @@ void of_kind(int kind, bool anchored) {
     outlook.look(b, q, d, work, curve, true);
     CHECK(std::fabs(outlook.work(0, known) - work) <= 1e-12 * std::fabs(work));
     CHECK(outlook.count == 1);
+    for (double a : {0.2, 1.3}) {  // how it rises further on
+      double slope, none;
+      outlook.work(a, slope);
+      const double differed = (outlook.work(a + 1e-5, none) - outlook.work(a - 1e-5, none)) / 2e-5;
+      CHECK(std::fabs(differed - slope) <= 1e-6 * (std::fabs(slope) + std::fabs(work)));
+    }
 
     for (int i = 0; i < Kind<V>::lanes; i++) {
       double other[NQ];
@@ -149,7 +174,7 @@ void of_kind(int kind, bool anchored) {
 int main() {
   for (int kind = 0; kind < KINDS; kind++) {
     const int before = failures();
-    for (bool anchored : {false, true}) of_kind(kind, anchored);
+    for (const Holding& how : HOLDINGS) of_kind(kind, how);
     if (failures() > before) std::fprintf(stderr, "kind %d\n", kind);
   }
   return failures();

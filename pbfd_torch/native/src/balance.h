@@ -32,13 +32,15 @@ template <class V, class N, int D = 3> struct Balance {
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
   Carriers<V> carriers;
+  Laws<V, N, D> laws;
   Contacts<V, N, D> contacts;
   Meetings<V, N, D> meetings;
 
   template <class X> static constexpr int in_registers(int count) { return int((count * sizeof(X) + sizeof(V) - 1) / sizeof(V)); }
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
-           in_registers<Push<V, D>>(s.nodes) + Contacts<V, N, D>::room(s) + Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
+           in_registers<Push<V, D>>(s.nodes) + Laws<V, N, D>::room(s) + Contacts<V, N, D>::room(s) +
+           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
            (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
@@ -47,7 +49,8 @@ template <class V, class N, int D = 3> struct Balance {
   }
 
   Balance(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), carriers(scene, arena), contacts(scene, relaxed, carriers, arena), meetings(scene, relaxed, arena) {
+      : plan(scene), carriers(scene, arena), laws(scene, relaxed, arena), contacts(scene, relaxed, laws, carriers, arena),
+        meetings(scene, relaxed, laws, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
     start.carriers = carriers.start, target.carriers = now.carriers = carriers.end;
@@ -74,7 +77,8 @@ template <class V, class N, int D = 3> struct Balance {
       if (heavy(k)) hold(plan, k, inert, share, start, target, holds[k]);
     carry();
     stiffen_limits(plan, steps(), limits);
-    contacts.begin(start, target, dt);
+    laws.begin(dt), laws.coast(target, dt);
+    contacts.begin(anew, start, target, dt);
     meetings.begin(anew, start, target, dt, sorted);
     if (meetings.slots.changed) part(), meetings.slots.changed = false;
   }
@@ -188,6 +192,10 @@ template <class V, class N, int D = 3> struct Balance {
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     contacts.each_normal_force(at, visit), meetings.each_normal_force(at, visit);
   }
+
+  // What anchors remember of the start of the step; and at its end, where the nodes are now and the contacts have looked.
+  void recall(const V* memory) { contacts.behind = memory, meetings.slots.behind = memory; }
+  void remember(V* memory) { contacts.remember(memory), meetings.remember(memory); }
 
   JointStep<V> steps() const { return {q_start, q_target, control, limits, fitted, dt, inert, relaxed}; }
 

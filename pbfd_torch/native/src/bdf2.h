@@ -12,7 +12,7 @@ template <class V> struct FourPoses {
   V *q, *history, *moves, *push, *behind;
   template <class F> static void each(Sizes s, F&& visit) {
     visit(&FourPoses::q, s.nq), visit(&FourPoses::history, 36 * s.nodes), visit(&FourPoses::moves, 3 * s.nv);
-    visit(&FourPoses::push, 1), visit(&FourPoses::behind, 3 * s.anchors);
+    visit(&FourPoses::push, 1), visit(&FourPoses::behind, s.remembered());
   }
 };
 
@@ -134,7 +134,7 @@ template <class V, class N, int D> struct Bdf2 {
   // How hard contacts and limits push in all at the end of a step, in weights (`BalanceObjective.push`).
   V push(const Balance<V, N, D>& b, const V* q) {
     V total(0);
-    b.each_normal_force(b.now, [&](int, V force) { total += force; });
+    b.each_normal_force(b.now, [&](int, V force, V) { total += force; });
     forces_of<LIMITS>(b, q, turned, slopes);
     const V reach = V(plan.reach[0]), weight = V(plan.scale[0]) / select(V(plan.turns[0]) > V(0), reach, V(1));
     for (int i = 0; i < plan.nv; i++) total += abs(turned[i]) / select(V(plan.turns[i]) > V(0), reach, V(1));

@@ -8,6 +8,7 @@ namespace pbfd {
 // How many there are: of candidates, of what anchors remember, and of what several candidates share.
 struct CandidateSizes {
   int candidates, anchors, planes, solids, samples, forms;
+  int uncommon = 0;  // laws of contact, between bodies too
 };
 
 template <class N, int D> struct Candidates {
@@ -16,8 +17,9 @@ template <class N, int D> struct Candidates {
   const int* counts;                    // [KINDS] candidates of each kind of pair
   const int *carrier, *solid, *form;    // node; which plane, or which other solid; which ellipsoid
   const int* anchor;                    // its place among what anchors remember; −1: it has none
+  const int* law;                       // which of the uncommon laws it has; −1: the usual one
   const N *position, *radius, *margin;  // [D] on the node, [1], [1]
-  const N *firmness, *grip, *deep;      // C⊥, μ, from which depth on it is a hazard
+  const N *firmness, *grip, *deep;      // C⊥, μ (see laws.h), from which depth on it is a hazard
   const N *per_release, *per_width;     // [s/m]; one over that of friction [s/m], or over the stretch of an anchor [1/m]
   const N* plane;                       // [D + 1] of a half-space: normal and offset in the world
   // of another solid: rotation and position in the world [12], its sizes [6], its thickness where it is convex; what is sampled
@@ -33,7 +35,7 @@ template <class N, int D> struct Candidates {
     auto whole = [&](int count) { const int* here = ints; ints += count; return here; };
     auto real = [&](int count) { const N* here = numbers; numbers += count; return here; };
     const int n = s.candidates;
-    counts = whole(KINDS), carrier = whole(n), solid = whole(n), form = whole(n), anchor = whole(n), grid = whole(4 * s.solids);
+    counts = whole(KINDS), carrier = whole(n), solid = whole(n), form = whole(n), anchor = whole(n), law = whole(n), grid = whole(4 * s.solids);
     position = real(D * n), radius = real(n), margin = real(n);
     firmness = real(n), grip = real(n), deep = real(n), per_release = real(n), per_width = real(n);
     plane = real((D + 1) * s.planes);
@@ -41,7 +43,7 @@ template <class N, int D> struct Candidates {
     ellipsoid = real(9 * s.forms), axis = real(3 * s.forms), lying = real(s.forms);
   }
 
-  static int whole_numbers(CandidateSizes s) { return KINDS + 4 * s.candidates + 4 * s.solids; }
+  static int whole_numbers(CandidateSizes s) { return KINDS + 5 * s.candidates + 4 * s.solids; }
   static int real_numbers(CandidateSizes s) {
     return (7 + D) * s.candidates + (D + 1) * s.planes + 19 * s.solids + 13 * s.forms;
   }

@@ -8,18 +8,21 @@
 namespace pbfd {
 
 template <class V, class N, int D> struct Contacts {
+  using Scalar = typename Kind<V>::Scalar;
   using M = typename Kind<V>::Mask;
   static constexpr int T = turns(D);
   const Plan<N, D>& plan;
   const Candidates<N, D>& candidates;
   const V* grip = nullptr;  // μ [candidates] of the worlds in the lanes
   const Relaxed<V>& relaxed;
+  const Laws<V, N, D>& laws;
   Carriers<V>& carriers;
   // what is fixed in a step
   const V* behind = nullptr;  // [3 × anchors] what the anchors are behind by, in the solids' own frames
   Poses<V> before;  // of the nodes at its start
   V per_dt;
   V* share;  // of its normal force that a candidate gives
+  V* bounce;  // [uncommon] how far its solid is moved out, of those that throw candidates back
   V* guard;  // [2 + D] 1 where a plane stands for the solid, else 0, and its normal and offset
   // of the nodes at a configuration: the rotation since the start and how it answers a turn, where asked for
   Poses<V> now;
@@ -29,17 +32,18 @@ template <class V, class N, int D> struct Contacts {
   int turning, turned_on;
 
   static int room(Sizes s) {
-    return (3 + D) * s.candidates + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return (3 + D) * s.candidates + s.uncommon + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
-  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, Carriers<V>& moving, Arena<V>& arena)
-      : plan(scene), candidates(scene.contact), relaxed(easier), carriers(moving) {
+  Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Carriers<V>& moving, Arena<V>& arena)
+      : plan(scene), candidates(scene.contact), relaxed(easier), laws(all), carriers(moving) {
     share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
+    bounce = arena.take(plan.uncommon);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
   }
 
-  // The step begins at these poses, and would lead to `free` without contacts.
-  void begin(Poses<V> start, Poses<V> free, V step) {
+  // The step begins at these poses, and would lead to `free` without contacts. `anew`: which lanes begin it.
+  void begin(M anew, Poses<V> start, Poses<V> free, V step) {
     before = start, per_dt = V(1) / step;
     if constexpr (D == 3) carriers.begin(plan.belt, step);
     each_kind(candidates, [&](auto pair, int first, int last) {
@@ -55,6 +59,30 @@ template <class V, class N, int D> struct Contacts {
         if constexpr (Surface::convex) keep_outside(i, c, solid, free);
       }
     });
+    if (laws.throwing) throw_back(anew, free, step);
+  }
+  // What is fixed in a step while its motion without contacts may be made shorter.
+  [[gnu::noinline]] void throw_back(M anew, Poses<V> free, V step) {
+    each_kind(candidates, [&](auto pair, int first, int last) {
+      for (int i = first; i < last; i++) {
+        const Law<V>* law = laws.at(candidates.law[i]);
+        if (!law || !law->throws()) continue;
+        V c[D];
+        Beside<V, D> solid;
+        const V start = -began(pair, i, c, solid);
+        auto gap = [&](Poses<V> at) {
+          center(i, at, c);
+          return -depth(pair, i, at, c, solid);
+        };
+        V& out = bounce[candidates.law[i]];
+        out = select(anew, law->bounce(start, gap(free), gap(laws.coasting), step), out);
+      }
+    });
+  }
+  // How far the solid of a candidate is moved out.
+  V moved_out(int i) const {
+    const Law<V>* law = laws.throwing ? laws.at(candidates.law[i]) : nullptr;
+    return law && law->throws() ? bounce[candidates.law[i]] : V(0);
   }
 
   // The nodes are at these poses.
@@ -73,6 +101,7 @@ template <class V, class N, int D> struct Contacts {
         Touching<V, D> t;
         center(i, now, t.center);
         t.depth = depth(pair, i, now, t.center, t.solid);
+        if (laws.throwing) t.depth += moved_out(i);
         t.holding = relaxed.holding(i);
         if (!any((t.depth > V(0)) | (t.holding > V(0)))) continue;
         touch(pair, i, t);
@@ -113,7 +142,8 @@ template <class V, class N, int D> struct Contacts {
     return traced < V(D - 2);
   }
 
-  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  // What the normal forces of the step's own problem are where nodes are at these poses, and what lagged friction feels there:
+  // visit(candidate, force, felt).
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     each_kind(candidates, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) {
@@ -123,8 +153,11 @@ template <class V, class N, int D> struct Contacts {
         center(i, at, c);
         V firmness = V(candidates.firmness[i]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
-        release_law(firmness, depth(pair, i, at, c, solid), start, per_dt * V(candidates.per_release[i]), push, rises);
-        visit(i, push);
+        const Law<V>* law = laws.at(candidates.law[i]);
+        V d = depth(pair, i, at, c, solid);
+        if (laws.throwing) firmness = harder(i, firmness), d += moved_out(i);
+        normal_force(law, firmness, d, start, per_dt * V(candidates.per_release[i]), push, rises);
+        visit(i, push, law ? law->feels(push, d) : push);
       }
     });
   }
@@ -202,7 +235,7 @@ template <class V, class N, int D> struct Contacts {
     return reach + V(candidates.margin[i]) - solid.distance;
   }
 
-  // What its normal force stores where the nodes are: C d³/3 (Eq. 9), of the solid itself.
+  // What its normal force stores where the nodes are: C d^(α+1)/(α+1) (Eq. 9), of the solid itself.
   template <class Pair> V stored(Pair, int i) const {
     const V* R = now.rotation + D * D * candidates.carrier[i];
     V c[D], firmness = V(candidates.firmness[i]);
@@ -211,6 +244,8 @@ template <class V, class N, int D> struct Contacts {
     beside<typename Pair::Surface>(i, c, solid);
     if constexpr (Pair::Support::wanders) firmness = firmness * Pair::Support::share(candidates, i, R, solid.normal);
     const V d = max(sunk(Pair(), i, R, solid), V(0));
+    const Law<V>* law = laws.at(candidates.law[i]);
+    if (!squared(law)) return firmness * power(d, law->exponent + Scalar(1)) / V(law->exponent + Scalar(1));
     return V(1) / V(3) * firmness * d * d * d;
   }
 
@@ -235,7 +270,8 @@ template <class V, class N, int D> struct Contacts {
     t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
     t.per_range = per_dt * V(candidates.per_release[i]);
     t.per_width = (anchored(i) ? V(1) : per_dt) * V(candidates.per_width[i]) / relaxed.width;
-    t.relaxed = &relaxed;
+    t.relaxed = &relaxed, t.law = laws.at(candidates.law[i]);
+    if (laws.throwing) t.firmness = harder(i, t.firmness);
     if constexpr (Pair::Support::wanders) t.firmness = t.firmness * share[i];
     if (!Pair::Support::rolls) return;
     if (const int m = mover(i); m >= 0) return turn_beside(k, m, t);
@@ -247,10 +283,15 @@ template <class V, class N, int D> struct Contacts {
   // Scenes with anchors are seen in space.
   bool anchored(int i) const { return D == 3 && candidates.anchor[i] >= 0; }
 
+  V harder(int i, V firmness) const {
+    const Law<V>* law = laws.at(candidates.law[i]);
+    return law && law->throws() ? law->harder(firmness, bounce[candidates.law[i]]) : firmness;
+  }
+
   template <class Pair> void keep(Pair pair, int i, V* kept) {
     Touching<V, D> t;
     center(i, now, t.center);
-    t.depth = depth(pair, i, now, t.center, t.solid);
+    t.depth = depth(pair, i, now, t.center, t.solid) + moved_out(i);
     const M holds = t.depth > V(0);
     if (!any(holds)) return;
     touch(pair, i, t);

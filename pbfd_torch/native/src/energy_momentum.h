@@ -17,7 +17,7 @@ template <class V> struct Velocities {
     using X = Velocities;
     visit(&X::q, s.nq), visit(&X::v, s.nv), visit(&X::push, s.nv), visit(&X::steady, s.nv), visit(&X::lag, s.nv);
     visit(&X::average, s.nv), visit(&X::gained, 1), visit(&X::surplus, 1), visit(&X::peak, 1);
-    visit(&X::behind, 3 * s.anchors);
+    visit(&X::behind, s.remembered());
   }
 };
 

@@ -11,11 +11,16 @@ template <class V> struct Spot {
   V normal[3], offset;    // of the plane
   V passed, near;         // 1 or 0, see finder.h
   V slot;                 // its place among the candidates of its lane
+  V anchor[3];            // what its anchor is behind by as the solid's node sees it
   V start[3], began;      // where the solid's body sees the point at the start, less what its belt runs; and how deep it is there
+  V bounce;               // how far the solid is moved out for the step to throw the point back
+  // of curved bodies, see curved.h
+  V rim, lying, share;                    // 1 where it is an ellipsoid's, else 0; see terms/lying.py, and what follows for this step
+  V follows, swept[2], other[3];          // 1 or 0; where round bodies come closest, on the node of the other one
 
   void clear() {
-    there = slot = offset = passed = near = began = V(0);
-    for (int j = 0; j < 3; j++) position[j] = normal[j] = start[j] = V(0);
+    there = slot = offset = passed = near = began = bounce = rim = lying = share = follows = swept[0] = swept[1] = V(0);
+    for (int j = 0; j < 3; j++) position[j] = normal[j] = anchor[j] = start[j] = other[j] = V(0);
   }
 };
 
@@ -27,6 +32,11 @@ struct Face {
     out.distance = dot(p, spot.normal) - spot.offset, out.steepness = V(1);
   }
   template <class V, class T> static void bend(const Spot<V>&, const T*, const V*, const Beside<V, 3>&, V*) {}
+};
+
+// The same, near which the direction is between round bodies that come closest: it turns with both.
+struct Near : Face {
+  static constexpr bool flat = false;
 };
 
 // The numbers of a solid as lanes see them.

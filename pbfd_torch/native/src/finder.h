@@ -1,8 +1,10 @@
-// Candidates between bodies at the start of a step, of one world, as contact/round_pairs.py, ball_pairs.py and polytope_pairs.py.
+// Candidates between bodies at the start of a step, of one world, as contact/round_pairs.py, ball_pairs.py, polytope_pairs.py,
+// curved_pairs.py and closest_pairs.py.
 #pragma once
 #include <algorithm>
 
 #include "bodies.h"
+#include "closest.h"
 #include "manifold.h"
 #include "solids.h"
 
@@ -14,6 +16,12 @@ template <class T> struct Found {
   int row;
   T position[3], normal[3], offset, gap;
   bool passed, near;
+  // of curved bodies, see facets.h
+  bool rim, follows, swept[2];
+  int lying;
+  T other[3];
+
+  void on_plane() { passed = true, near = rim = follows = swept[0] = swept[1] = false, lying = 0, other[0] = other[1] = other[2] = T(0); }
 };
 
 // The sizes of one solid, as solids ask for them.
@@ -76,14 +84,17 @@ template <class T> struct Finder {
   bool find(int group, bool sorted) {
     count = 0;
     const int kind = bodies.finder[group], first = bodies.first_pair[group], last = bodies.first_pair[group + 1];
-    if (kind == POLYTOPE_PAIRS) surround(group, first, last);
+    if (kind == POLYTOPE_PAIRS || kind == CURVED_PAIRS) surround(group, first, last);
     for (int p = first; p < last; p++) {
       if (kind == ROUND_PAIRS)
         find_round(group, p);
       else if (kind == BALL_PAIRS)
         find_ball(group, p);
-      else if (overlap(bodies.one[p], bodies.other[p]))
-        find_polytopes(group, p);
+      else if (kind == CLOSEST_PAIRS)
+        find_closest(group, p);
+      else if (overlap(bodies.one[p], bodies.other[p])) {
+        if (kind == POLYTOPE_PAIRS || !met_at_one_point(group, p)) find_polytopes(group, p);
+      }
     }
     for (int i = 0; i < count; i++) order[i] = i;
     const bool dropped = count > bodies.kept[group];
@@ -106,6 +117,8 @@ template <class T> struct Finder {
     }
     return fma(T(1.5), traveled, bodies.slack[group]);
   }
+
+  static constexpr double SHORT = 1e-3;  // of a cylinder's length: rims nearer to one another are one
 
   const Pose<T>& standing(int node) const { return node < 0 ? world : start[node]; }
   const Pose<T>& going(int node) const { return node < 0 ? world : ahead[node]; }
@@ -211,14 +224,91 @@ template <class T> struct Finder {
     meet(bodies.hulls, a, b, bodies.boxes[p] != 0, places[a], places[b], within, met);
     const T* points = bodies.collider + 12 * (met.swapped ? b : a);
     const T* plane = bodies.collider + 12 * (met.swapped ? a : b);
-    for (int i = 0; i < met.count; i++) {
-      if (!(met.gap[i] < within)) continue;
+    const Hull<T> hull = bodies.hulls[met.swapped ? b : a];
+    const auto add = [&](const T* point, T gap) -> Found<T>& {
       Found<T>& out = found[count++];
-      out.row = bodies.row[p] + met.swapped, out.gap = met.gap[i], out.passed = true, out.near = false;
-      times(points, met.point[i], out.position), times(plane, met.normal, out.normal);
+      out.on_plane();
+      out.row = bodies.row[p] + met.swapped, out.gap = gap;
+      times(points, point, out.position), times(plane, met.normal, out.normal);
       for (int j = 0; j < 3; j++) out.position[j] += points[9 + j];
       out.offset = met.offset + dot(out.normal, plane + 9);
+      // beside curved bodies points reach a little too (terms/supported.py)
+      if (bodies.finder[group] == CURVED_PAIRS && bodies.meeting[out.row] < CURVED) out.offset += T(Ellipsoid::POINT);
+      return out;
+    };
+    for (int i = 0; i < met.count; i++) {
+      if (!(met.gap[i] < within) || (hull.curved && hull.half() == 0)) continue;
+      add(met.point[i], met.gap[i]).lying = hull.curved;
     }
+    if (!hull.curved || met.count == 0) return;
+    // its rims, at both ends of where it overlaps; an ellipsoid has one, itself
+    T low = met.point[0][2], high = low, own[3], n[3];
+    for (int i = 1; i < met.count; i++) low = min(low, met.point[i][2]), high = max(high, met.point[i][2]);
+    const T half = hull.half(), ends[2] = {clamped(low, -half, half), clamped(high, -half, half)};
+    const Pose<T>&over = places[met.swapped ? b : a], &under = places[met.swapped ? a : b];
+    times(under.rotation, met.normal, n), transposed_times(over.rotation, n, own);
+    const T squares[3] = {own[0] * own[0], own[1] * own[1], own[2] * own[2]}, reach = sqrt(dot(hull.form(), squares));
+    for (int i = 0; i < (ends[1] - ends[0] > T(SHORT) * half ? 2 : 1); i++) {
+      const T center[3] = {T(0), T(0), ends[i]};
+      T x[3], seen[3];
+      placed(over, center, x), seen_from(under, x, seen);
+      const T gap = dot(seen, met.normal) - met.offset - reach;
+      if (!(gap < within)) continue;
+      Found<T>& out = add(center, gap);
+      out.rim = true, out.lying = half > 0 ? -1 : 0;
+    }
+  }
+
+  // Of round bodies that have no flat caps.
+  void find_closest(int group, int p) {
+    const T *numbers = bodies.numbers + NUMBERS_OF_A_PAIR * p, within = moves(group, p);
+    RoundPair<T> pair;
+    Sought<T> found;
+    round_pair(p, pair);
+    if (apart(pair.center[0], pair.center[1]) - numbers[12] >= within) return;
+    seek(pair, found);
+    if (found.gap < within) add_met(p, pair, found, !held_apart(pair, found.gap, within));
+  }
+  // Whether two bodies are round and touch at one point alone; then adds it. What may come past the other body meets planes with all
+  // its corners, as polytopes do.
+  bool met_at_one_point(int group, int p) {
+    if (bodies.numbers[NUMBERS_OF_A_PAIR * p + 13] == 0) return false;
+    const T within = moves(group, p);
+    RoundPair<T> pair;
+    Sought<T> found;
+    round_pair(p, pair);
+    seek(pair, found);
+    if (!found.alone || held_apart(pair, found.gap, within)) return false;
+    if (found.gap < within) add_met(p, pair, found, true);
+    return true;
+  }
+
+  // In the world.
+  int round_row(int p) const { return bodies.row[p] + (bodies.numbers[NUMBERS_OF_A_PAIR * p + 11] > 0); }
+  void round_pair(int p, RoundPair<T>& out) const {
+    const T* numbers = bodies.numbers + NUMBERS_OF_A_PAIR * p;
+    const int row = round_row(p), nodes[2] = {bodies.first[row], bodies.second[row]};
+    const T *of_row = bodies.of_row + NUMBERS_OF_A_ROW * row, ball = of_row[0] * of_row[0];
+    out.thin = numbers[8];
+    for (int i = 0; i < 2; i++) {
+      const Pose<T>& body = standing(nodes[i]);
+      T form[9], half[9];
+      for (int j = 0; j < 9; j++) form[j] = of_row[1 + 12 * i + j] + (i == 0 && j % 4 == 0 ? ball : T(0));
+      product(body.rotation, form, half), product_transposed(half, body.rotation, out.form[i]);
+      placed(body, numbers + 3 * i, out.center[i]), times(body.rotation, of_row + 10 + 12 * i, out.axis[i]);
+      out.half[i] = numbers[6 + i], out.capped[i] = numbers[9 + i] > 0;
+    }
+  }
+  void add_met(int p, const RoundPair<T>& pair, const Sought<T>& sought, bool follows) {
+    Found<T>& out = found[count++];
+    Spotted<T> met;
+    spot(pair, sought, met), out.on_plane();
+    out.row = round_row(p), out.gap = sought.gap, out.rim = true, out.follows = follows;
+    const Pose<T>&over = standing(bodies.first[out.row]), &under = standing(bodies.second[out.row]);
+    seen_from(over, met.center[0], out.position), seen_from(under, met.center[1], out.other);
+    transposed_times(under.rotation, met.normal, out.normal);
+    out.offset = dot(out.normal, out.other) + met.reach;
+    for (int i = 0; i < 2; i++) out.swept[i] = met.swept[i];
   }
 };
 

@@ -8,7 +8,8 @@
 //     ends   [edges, 2]      vertices; the point is an edge of length zero
 //     corner [start[polygons]]  vertices of the polygons, counter-clockwise seen from outside
 // real: of each shape
-//     [14]  radius, size, thickness, form [3], half; half extents of a box [3]; the middle of the vertices [3]; 0
+//     [14]  radius, size, thickness, form [3], half; half extents of a box [3]; the middle of the vertices [3]; how far the curved
+//           shape goes beyond the polytope that stands for it, at most; 0 for others
 //     vertex [vertices, 3]
 //     plane  [faces, 4]      unit outward normal and offset
 //     edge   [edges, 9]      unit direction from the first end to the second (zero for the point), and the normals of the face
@@ -40,6 +41,7 @@ template <class T> struct Hull {
   T half() const { return number[6]; }
   const T* extents() const { return number + 7; }
   const T* middle() const { return number + 10; }
+  T bulge() const { return number[13]; }
 
   int corners(int polygon) const { return start[polygon + 1] - start[polygon]; }
   const int* polygon(int i) const { return corner + start[i]; }

@@ -11,7 +11,7 @@ template <class V> struct Positions {
   V *q, *q_previous, *acceleration, *behind;
   template <class F> static void each(Sizes s, F&& visit) {
     visit(&Positions::q, s.nq), visit(&Positions::q_previous, s.nq), visit(&Positions::acceleration, s.nv);
-    visit(&Positions::behind, 3 * s.anchors);
+    visit(&Positions::behind, s.remembered());
   }
 };
 

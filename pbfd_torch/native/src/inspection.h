@@ -4,14 +4,14 @@
 
 namespace pbfd {
 
-// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. behind: see `Contacts`; `from`, `to`: where
-// the obstacles that move begin and end.
+// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. behind: what anchors remember;
+// `from`, `to`: where the obstacles that move begin and end.
 template <class T, int D>
 inline void inspect(const Plan<T, D>& plan, const T* behind, const T* q, const T* v, const T* control, const T* at, T dt,
                     const T* from, const T* to, Arena<T> arena, T* residual, T* matrix) {
   Balance<T, T, D> balance(plan, arena);
   T* room = arena.take(18 * plan.nodes);
-  balance.dt = dt, balance.share = T(0.5), balance.contacts.grip = plan.contact.grip, balance.contacts.behind = behind;
+  balance.dt = dt, balance.share = T(0.5), balance.contacts.grip = plan.contact.grip, balance.recall(behind);
   for (int j = 0; j < plan.nv; j++) balance.fitted[j] = plan.share[j];
   for (int j = 0; j < plan.nu; j++) balance.control[j] = control[j];
   balance.carriers.load(0, from, to);

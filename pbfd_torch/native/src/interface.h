@@ -14,14 +14,14 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
-  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, anchors, planes, solids, samples, forms, pushes;
+  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, anchors, planes, solids, samples, forms, uncommon, pushes;
   int varied;  // numbers of which each world has its own: others than μ in space only, and not of BDF2
   const int* whole;
   const void* real;
   const void* sample;  // of terrain and meshes
   const int* which;    // [varied] of `real`, in order
   // contact between bodies, in space only, as bodies.h reads it
-  int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0;
+  int links = 0, groups = 0, rows = 0, pairs = 0, colliders = 0, slots = 0, remembered = 0;
   const int* body_whole = nullptr;
   const void* body_real = nullptr;
   int moving = 0;  // obstacles in prescribed motion, in space only
@@ -29,7 +29,7 @@ struct pbfd_plan {
 
 // Steps of worlds `first` … `last` − 1. Each array is [worlds, count], or [steps, worlds, count].
 //   given: of the state that each world goes on from: q, v, push, steady, lag, average, gained, surplus, peak (`Velocities`), or q,
-//     q_previous, acceleration (`Positions`), or q, history, moves, push (`FourPoses`); and behind, [3 · anchors] of its memory, where there are any;
+//     q_previous, acceleration (`Positions`), or q, history, moves, push (`FourPoses`); and what anchors remember, [3 · anchors + remembered], where there are any;
 //   control: [worlds, nu] for all steps if `held`, else [steps, worlds, nu];
 //   found: what is given, after each step, [steps, …];
 //   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].

@@ -11,7 +11,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 9; }
+int pbfd_interface() { return 10; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -20,9 +20,9 @@ const char* pbfd_target() { return target; }
 namespace {
 
 Sizes sizes(const pbfd_plan* p) {
-  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms};
+  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
   return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
-          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots}, p->moving};
+          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}, p->moving};
 }
 
 template <class T, class A> Timetable<T> timetable(const pbfd_plan* p, const A* asked) {
@@ -107,7 +107,7 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
   with_each<T, D>(p, s->own, {static_cast<T*>(room)}, [&](const Plan<T, D>& plan, Numbers<T>& own, const T*, Arena<T>& arena) {
     for (int w = s->first; w < s->last; w++) {
       own.load(0, w);
-      inspect(plan, p->anchors ? row(s->given[9], w, 3 * p->anchors) : nullptr, row(s->given[0], w, p->nq),
+      inspect(plan, plan.remembered() ? row(s->given[9], w, plan.remembered()) : nullptr, row(s->given[0], w, p->nq),
               row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt),
               timetable<T>(p, s).at(0, w), timetable<T>(p, s).at(1 << p->halvings, w), arena,
               static_cast<T*>(residual) + long(w) * p->nv, static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);

@@ -42,7 +42,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
-    newton.balance.contacts.behind = before.behind;
+    newton.balance.recall(before.behind);
     sight.there.carriers = newton.balance.now.carriers;
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
   }
@@ -176,11 +176,11 @@ template <class V, class N, int D, class Scheme> struct Machine {
     for (int i = 0; i < plan.nq; i++) b.q_target[i] = select(shorter, from[i], b.q_target[i]);
   }
 
-  // Friction is to feel the normal forces where lanes set out from.
+  // Friction is to feel the normal forces, or depths, where lanes set out from.
   void hold(M which) {
     Balance<V, N, D>& b = newton.balance;
     sight.look(from);
-    b.each_normal_force(sight.there, [&](int i, V force) { b.relaxed.held[i] = select(which, force, b.relaxed.held[i]); });
+    b.each_normal_force(sight.there, [&](int i, V, V felt) { b.relaxed.held[i] = select(which, felt, b.relaxed.held[i]); });
   }
 
   // Lanes whose solve has ended take the next detour, or their attempt has ended; who sets out now.
@@ -226,7 +226,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
     const M refused = scheme.advance(b, newton.q, before, after, eased);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
-    if (plan.anchors > 0) b.contacts.remember(after.behind);
+    if (plan.remembered() > 0) b.remember(after.behind);
     M kept(false), solved(false), failed(false), part(false), lost(false);
     const Hazards<V> seen = look_for_hazards();
     for (int i = 0; i < W; i++) {

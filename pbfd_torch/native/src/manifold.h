@@ -188,7 +188,7 @@ inline void meet(const Hulls<T>& hulls, int a, int b, bool boxes, const Pose<T>&
   for (int i = 0; i < 3; i++) sum += T(0) * pose_b.position[i] + T(0) * pair.a_in_b.position[i];
   for (int i = 0; i < 9; i++) sum += T(0) * pose_b.rotation[i] + T(0) * pair.a_in_b.rotation[i];
   if (!(sum == 0)) return;
-  const T most = moves + T(0.01) * max(pair.a.size(), pair.b.size());
+  const T most = moves + T(0.01) * max(pair.a.size(), pair.b.size()) + (pair.a.bulge() + pair.b.bulge());
   (boxes ? box_separation<T> : separation<T>)(pair, pose_b, most, apart);
   if (apart.beyond || apart.along > most) return;
   // apart, and perhaps past the middle of the thinner one at the end: whatever corner turns round meets the plane as well

@@ -25,6 +25,7 @@ template <class V, class N, int D> struct Meetings {
   const Plan<N, D>& plan;
   const Bodies<T>& bodies;
   const Relaxed<V>& relaxed;
+  const Laws<V, N, D>& laws;
   Slots<V, N, D> slots;
   V per_dt;
   // of the nodes at a configuration
@@ -37,8 +38,8 @@ template <class V, class N, int D> struct Meetings {
     const int rows = D == 3 ? s.bodies.rows : 0;
     return Slots<V, N, D>::room(s) + Slots<V, N, D>::in(int(sizeof(Push<V, 3>)) * rows) + 12 * rows + Slots<V, N, D>::in(rows);
   }
-  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, Arena<V>& arena)
-      : plan(scene), bodies(scene.pairing), relaxed(easier), slots(scene, arena) {
+  Meetings(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Arena<V>& arena)
+      : plan(scene), bodies(scene.pairing), relaxed(easier), laws(all), slots(scene, arena) {
     const int rows = D == 3 ? bodies.rows : 0;
     sums = reinterpret_cast<Push<V, 3>*>(arena.take(slots.in(int(sizeof(Push<V, 3>)) * rows)));
     turned_by = arena.take(3 * rows), rollings = arena.take(9 * rows);
@@ -52,7 +53,25 @@ template <class V, class N, int D> struct Meetings {
   void begin(M which, Poses<V> start, Poses<V> free, V dt, bool sorted) {
     per_dt = V(1) / dt;
     if constexpr (D == 3)
-      if (bodies.rows > 0) slots.find(which, start, free, dt, sorted);
+      if (bodies.rows > 0) {
+        slots.find(which, start, free, dt, sorted);
+        if (laws.throwing) throw_back(which, free, dt);
+      }
+  }
+  [[gnu::noinline]] void throw_back(M which, Poses<V> free, V dt) {
+    if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
+      const Law<V>* law = laws.at(bodies.law[r]);
+      if (!law || !law->throws()) return;
+      each_spot(r, [&](Spot<V>& s, int) {
+        auto gap = [&](Poses<V> at) {
+          V c[3];
+          Beside<V, 3> solid;
+          return -depth(pair, r, s, at, c, solid);
+        };
+        const V found = law->bounce(-s.began, gap(free), gap(laws.coasting), dt);
+        s.bounce = select(which, select(s.there > V(0), found, V(0)), s.bounce);
+      });
+    });
   }
 
   // The nodes are at these poses.
@@ -68,7 +87,7 @@ template <class V, class N, int D> struct Meetings {
       sums[r].any = false;
       each_spot(r, [&](Spot<V>& s, int held) {
         Touching<V, 3> t;
-        t.depth = depth(pair, r, s, now, t.center, t.solid), t.holding = relaxed.holding(held);
+        t.depth = depth(pair, r, s, now, t.center, t.solid) + s.bounce, t.holding = holding(s, held);
         if (!any((t.depth > V(0)) | (t.holding > V(0)))) return;
         touch(pair, r, s, t);
         pbfd::press<Pair::Surface::flat, typename Pair::Support>(t, sums[r]);
@@ -93,14 +112,17 @@ template <class V, class N, int D> struct Meetings {
       }
   }
 
-  // What the normal forces of the step's own problem are where nodes are at these poses: visit(candidate, force).
+  // See `Contacts`.
   template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
     if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
       each_spot(r, [&](Spot<V>& s, int held) {
-        V c[3], push, rises;
+        V c[3], push, rises, firmness = V(slots.laws(r)[0]);
         Beside<V, 3> solid;
-        release_law(V(slots.laws(r)[0]), depth(pair, r, s, at, c, solid), s.began, per_dt * V(slots.laws(r)[3]), push, rises);
-        visit(held, push);
+        const Law<V>* law = laws.at(bodies.law[r]);
+        if constexpr (decltype(pair)::Support::wanders) firmness = firmness * s.share;
+        const V d = depth(pair, r, s, at, c, solid) + s.bounce;
+        normal_force(law, law ? law->harder(firmness, s.bounce) : firmness, d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        visit(held, push, law ? law->feels(push, d) : push);
       });
     });
   }
@@ -137,6 +159,25 @@ template <class V, class N, int D> struct Meetings {
     return found;
   }
 
+  bool anchored(int r) const { return bodies.memory[bodies.group[r]] >= 0; }
+
+  // What anchors remember after a step of the step's own problem that ended where the nodes are now, see `Contacts::remember`: each
+  // lane of its own candidates, in its own slots.
+  [[gnu::noinline]] void remember(V* memory) {
+    if constexpr (D == 3) {
+      if (bodies.remembered == 0) return;
+      for (int j = 0; j < bodies.remembered; j++)
+        memory[3 * plan.anchors + j] = V(T(j % NUMBERS_OF_AN_ANCHOR == NUMBERS_OF_AN_ANCHOR - 1 ? -1 : 0));
+      slots.each_row([&](auto pair, int r) {
+        if (!anchored(r)) return;
+        each_spot(r, [&](Spot<V>& s, int) { keep(pair, r, s, memory + bodies.memory[bodies.group[r]]); });
+      });
+    }
+  }
+
+  // What lagged friction feels; a lane without this candidate has never been asked.
+  V holding(const Spot<V>& s, int held) const { return select(s.there > V(0), relaxed.holding(held), V(0)); }
+
   // visit(spot, its number among all candidates)
   template <class F> void each_spot(int r, F&& visit) const {
     for (int j = 0; j < slots.most[r]; j++) visit(slots.spot[SPOTS * r + j], plan.candidates + SPOTS * r + j);
@@ -148,7 +189,11 @@ template <class V, class N, int D> struct Meetings {
     Pair::Surface::beside(s, slots.solid(r), own, solid);
     for (int j = 0; j < 3; j++) n[j] = solid.normal[j];
     times(slots.rotation(at, bodies.second[r]), n, solid.normal);
-    return select(s.there > V(0), V(slots.radius(r)) - solid.distance, V(-NOWHERE));
+    V depth = V(slots.radius(r)) - solid.distance;
+    if constexpr (Pair::Support::wanders)
+      depth = sunk<typename Pair::Support>(
+          s, slots.curved(r), slots.standing(at, bodies.first[r]), slots.standing(at, bodies.second[r]), c, solid);
+    return select(s.there > V(0), depth, V(-NOWHERE));
   }
 
   // The rest of what is to be known of a candidate whose centre and depth are.
@@ -156,10 +201,11 @@ template <class V, class N, int D> struct Meetings {
     using Surface = typename Pair::Surface;
     const V *R = slots.rotation(now, bodies.second[r]), *p = slots.position(now, bodies.second[r]);
     V carried[3];
-    times(R, s.start, carried);
+    const V start[3] = {s.start[0] - s.anchor[0], s.start[1] - s.anchor[1], s.start[2] - s.anchor[2]};
+    times(R, start, carried);
     for (int j = 0; j < 3; j++) t.moved[j] = t.center[j] - (carried[j] + p[j]);
     t.start = s.began;
-    if constexpr (!Surface::flat) {
+    if constexpr (!Surface::flat && !Pair::Support::leans) {
       Beside<V, 3> seen = t.solid;
       V own[3], bend[9], half[9];
       slots.seen(r, now, t.center, own), transposed_times(R, t.solid.normal, seen.normal);
@@ -167,7 +213,12 @@ template <class V, class N, int D> struct Meetings {
       product(R, bend, half), product_transposed(half, R, t.bend);
     }
     if constexpr (Pair::Support::rolls) {
-      Ball::arm<Surface::flat>(V(slots.radius(r)), t.solid.normal, t.bend, t.arm);
+      if constexpr (Pair::Support::wanders)
+        reach_out<typename Pair::Support>(
+            s, slots.curved(r), slots.standing(now, bodies.first[r]), slots.standing(now, bodies.second[r]), t.center, t.solid,
+            t.bend, t.arm);
+      else
+        Ball::arm<Surface::flat>(V(slots.radius(r)), t.solid.normal, t.bend, t.arm);
       if (!turned[r]) turn(r);
       t.turn = turned_by + 3 * r, t.rolling = rollings + 9 * r;
     } else {
@@ -175,10 +226,45 @@ template <class V, class N, int D> struct Meetings {
     }
     const N* law = slots.laws(r);
     t.firmness = relaxed.firmness * V(law[0]), t.grip = V(law[1]);
-    t.per_range = per_dt * V(law[3]), t.per_width = per_dt * V(law[4]) / relaxed.width, t.relaxed = &relaxed;
+    t.per_range = per_dt * V(law[3]), t.per_width = (anchored(r) ? V(1) : per_dt) * V(law[4]) / relaxed.width;
+    t.relaxed = &relaxed, t.law = laws.at(bodies.law[r]);
+    if constexpr (Pair::Support::wanders) t.firmness = t.firmness * s.share;
+    if (t.law) t.firmness = t.law->harder(t.firmness, s.bounce);
+  }
+  // s alone.
+  template <class Pair> void arm(Pair, int r, const Spot<V>& s, const Beside<V, 3>& solid, V* out) const {
+    if constexpr (Pair::Support::wanders)
+      arm_of(s, slots.curved(r), slots.standing(now, bodies.first[r]), solid, out);
+    else
+      for (int j = 0; j < 3; j++) out[j] = V(-slots.radius(r)) * solid.normal[j];
   }
 
  private:
+  template <class Pair> void keep(Pair pair, int r, const Spot<V>& s, V* memory) {
+    Touching<V, 3> t;
+    V u[3], seen[3], kept[3], off[3], x[3], F[9];
+    t.depth = depth(pair, r, s, now, t.center, t.solid);
+    touch(pair, r, s, t);
+    t.template slip<typename Pair::Support>(u);
+    const M holds = t.depth > V(0);
+    const V part = select(holds, V(1) / max(V(slots.laws(r)[4]) * sqrt(dot(u, u)), V(1)), V(0));
+    for (int j = 0; j < 3; j++) u[j] = part * u[j];
+    const T* frames = slots.own_frames(r);
+    transposed_times(slots.rotation(now, bodies.second[r]), u, seen);
+    for (int j = 0; j < 9; j++) F[j] = V(frames[12 + j]);
+    transposed_times(F, seen, kept);
+    for (int j = 0; j < 9; j++) F[j] = V(frames[j]);
+    for (int j = 0; j < 3; j++) off[j] = s.position[j] - V(frames[9 + j]);
+    transposed_times(F, off, x);
+    const V number = select(holds, V(T(bodies.danger[r])), V(-1));
+    for (int i = 0; i < Kind<V>::lanes; i++) {
+      if (!(lane(s.there, i) > T(0))) continue;
+      V* out = memory + NUMBERS_OF_AN_ANCHOR * int(lane(s.slot, i));
+      for (int j = 0; j < 3; j++) put(out[j], i, lane(kept[j], i)), put(out[3 + j], i, lane(x[j], i));
+      put(out[6], i, lane(number, i));
+    }
+  }
+
   // How the one body has turned since the start as the other one sees it, in the world's axes now.
   [[gnu::noinline]] void turn(int r) {
     const int a = bodies.first[r], b = bodies.second[r];

@@ -8,6 +8,7 @@ namespace pbfd {
 // A contact that may touch along the direction.
 template <class V> struct Coming {
   V depth, start, steepness, sinks, faster, stiffness, mu, holding, per_range, per_width, size, along, square, cube, fourth;
+  int law;  // −1: the usual one
 };
 
 // A limit that may be reached.
@@ -25,6 +26,7 @@ template <class V, class N, int D = 3> struct Outlook {
   V per_limit_range;
   double close;  // which part of the work may be left: where bodies couple, evaluations cost much more than looking well
   const Relaxed<V>* relaxed;
+  const Law<V>* laws;
 
   static int room(Sizes s) {
     return int(sizeof(Coming<V>) / sizeof(V)) * Balance<V, N, D>::held(s) + int(sizeof(Stop<V>) / sizeof(V)) * 2 * s.nv + 12 * s.nodes;
@@ -40,7 +42,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     count = limits = 0, base = slope = zero;
-    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt), relaxed = &b.relaxed;
+    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt), relaxed = &b.relaxed, laws = b.laws.law;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, twist, d, drift);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
@@ -87,6 +89,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const V *c = at.center, *n = at.solid.normal;
     contacts.center(i, contacts.now, at.center);
     at.depth = contacts.depth(pair, i, contacts.now, c, at.solid);
+    if (contacts.laws.throwing) at.depth += contacts.moved_out(i);
     V v[D], a[D];
     move(k, c, v, a);
     if constexpr (!simple) {
@@ -119,7 +122,8 @@ template <class V, class N, int D = 3> struct Outlook {
   void foresee(Meetings<V, N, D>& meetings, Pair pair, int r, const Spot<V>& spot, int held, typename Kind<V>::Mask where) {
     const V zero(0);
     Touching<V, 3> at;
-    at.depth = meetings.depth(pair, r, spot, meetings.now, at.center, at.solid), at.holding = relaxed->holding(held);
+    at.depth = meetings.depth(pair, r, spot, meetings.now, at.center, at.solid) + spot.bounce;
+    at.holding = meetings.holding(spot, held);
     V v[3], a[3], v_other[3], a_other[3], w[3], spin[3];
     const V *c = at.center, *n = at.solid.normal;
     const int first = meetings.slots.on_tree(meetings.bodies.first[r]), second = meetings.slots.on_tree(meetings.bodies.second[r]);
@@ -130,15 +134,15 @@ template <class V, class N, int D = 3> struct Outlook {
       v[j] -= v_other[j], a[j] -= a_other[j];
     }
     add_cross(w, v, a);  // Coriolis: seen from a turning body
-    for (int j = 0; j < 3; j++) v_other[j] = V(-meetings.slots.radius(r)) * n[j];
+    meetings.arm(pair, r, spot, at.solid, v_other);
     add_cross(spin, v_other, v);
     const V sinks = -dot(v, n), faster = -dot(a, n);
     if (!any(((at.depth + at.solid.steepness * (max(sinks, zero) + V(0.5) * max(faster, zero)) > zero) | (at.holding > zero)) & where) &&
-        Pair::Surface::flat)
+        (Pair::Surface::flat || Pair::Support::leans))
       return;
     meetings.touch(pair, r, spot, at);
     V deepens = faster;
-    if constexpr (!Pair::Surface::flat) {
+    if constexpr (!Pair::Surface::flat && !Pair::Support::leans) {
       V tilt[3];
       times(at.bend, v, tilt);
       deepens -= dot(tilt, v);
@@ -163,6 +167,7 @@ template <class V, class N, int D = 3> struct Outlook {
     Coming<V>& out = coming[count++];
     out.depth = at.depth, out.start = at.start, out.sinks = sinks, out.faster = deepens, out.steepness = at.solid.steepness;
     out.stiffness = at.firmness, out.mu = at.grip, out.holding = at.holding, out.per_range = at.per_range, out.per_width = at.per_width;
+    out.law = at.law ? int(at.law - laws) : -1;
     V u[D];
     at.template travel<Support>(u);
     slide(out, u, at.solid.normal, v, a, faster);
@@ -182,6 +187,7 @@ template <class V, class N, int D = 3> struct Outlook {
   }
 
   V of_contact(const Coming<V>& c, V a, V& df) const {
+    if (c.law >= 0) return of_uncommon(c, laws + c.law, a, df);
     const V deep = fma(c.steepness * a, fma(V(0.5) * a, c.faster, c.sinks), c.depth), speed = fma(a, c.faster, c.sinks);
     V push, rises, factor, falls;
     release_law(c.stiffness, deep, c.start, c.per_range, push, rises);
@@ -194,6 +200,20 @@ template <class V, class N, int D = 3> struct Outlook {
     const V grows = c.steepness * speed, drags = (firmer * grows * factor + pressed * falls * on) * on + pressed * factor * further;
     df = rises * grows * speed + push * c.faster + c.mu * drags;
     return push * speed + c.mu * pressed * factor * on;
+  }
+
+  [[gnu::noinline]] V of_uncommon(const Coming<V>& c, const Law<V>* law, V a, V& df) const {
+    const V deep = fma(c.steepness * a, fma(V(0.5) * a, c.faster, c.sinks), c.depth), speed = fma(a, c.faster, c.sinks);
+    V push, rises;
+    normal_force(law, c.stiffness, deep, c.start, c.per_range, push, rises);
+    const V square = c.size + a * (V(2) * c.along + a * (c.square + a * (c.cube + V(0.25) * a * c.fourth)));
+    const V on = c.along + a * (c.square + a * (V(1.5) * c.cube + V(0.5) * a * c.fourth));
+    const V further = c.square + a * (V(3) * c.cube + V(1.5) * a * c.fourth), grows = c.steepness * speed;
+    Grasp<V> g;
+    friction(law, *relaxed, c.mu, c.per_width, c.holding, push, rises, deep, sqrt(max(square, V(0))), g);
+    const V slope = (rises + g.lift_by_depth) * grows + g.lift_by_size * on;
+    df = slope * speed + (push + g.lift) * c.faster + (g.by_depth * grows + g.by_size * on) * on + g.drag * further;
+    return (push + g.lift) * speed + g.drag * on;
   }
 
   V of_limit(const Stop<V>& s, V a, V& df) const {

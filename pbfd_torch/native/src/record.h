@@ -63,13 +63,13 @@ template <class V, class N, class Scheme> struct Recorder {
   // Of steps first … last − 1 of all steps of all worlds.
   void write(const Record<T>& to, int first, int last) {
     record = &to;
-    balance.dt = V(to.dt), balance.contacts.behind = before.behind;
+    balance.dt = V(to.dt), balance.recall(before.behind);
     for (at = first; at < last; at += W) {
       count = last - at < W ? last - at : W;
       for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));
       place(plan, after.q, balance.now, balance.axes);
-      balance.contacts.look(balance.now), balance.meetings.look(balance.now);
-      write_state();
+      balance.contacts.look(balance.now);
+      balance.laws.begin(balance.dt), write_state();
       if (record->suspect) write_step();
     }
   }
@@ -185,8 +185,10 @@ template <class V, class N, class Scheme> struct Recorder {
   void write_step() {
     Contacts<V, N, D>& contacts = balance.contacts;
     scheme.begin(balance, before, guess, M(false));
-    contacts.begin(balance.start, balance.target, balance.dt);
+    balance.laws.coast(balance.target, balance.dt);
+    contacts.begin(M(true), balance.start, balance.target, balance.dt);
     balance.meetings.begin(M(true), balance.start, balance.target, balance.dt, true);
+    balance.meetings.look(balance.now);  // at the rows that have just been found
     V worst = listed(roster.still_strain()), number = listed(roster.still_suspect());
     auto strained = [&](V share, int danger) {  // of those strained alike, the first
       const V this_one = V(T(danger));
@@ -197,13 +199,14 @@ template <class V, class N, class Scheme> struct Recorder {
       for (int i = from; i < to; i++) {
         Touching<V, D> t;
         contacts.center(i, balance.now, t.center);
-        t.depth = contacts.depth(pair, i, balance.now, t.center, t.solid), t.holding = V(0);
+        const V sunk = contacts.depth(pair, i, balance.now, t.center, t.solid);
+        t.depth = sunk + contacts.moved_out(i), t.holding = V(0);
         contacts.touch(pair, i, t);
         Force<V, D> found;
         force<typename decltype(pair)::Support>(t, found);
         for (int j = 0; j < count; j++) show(j, roster.slot[i], t, found);
-        const M far = (t.depth > V(0)) & contacts.turned_far(i);
-        strained(t.depth / V(plan.contact.deep[i]) + select(far, V(1), V(0)), roster.danger[i]);
+        const M far = (sunk > V(0)) & contacts.turned_far(i);
+        strained(sunk / V(plan.contact.deep[i]) + select(far, V(1), V(0)), roster.danger[i]);
       }
     });
     show_meetings(strained);
@@ -224,16 +227,17 @@ template <class V, class N, class Scheme> struct Recorder {
         for (int c = 0; c < bodies.kept[g]; c++) show(i, roster.meeting_slot[g] + c, t, none);
     meetings.slots.each_row([&](auto pair, int r) {
       meetings.each_spot(r, [&](Spot<V>& s, int) {
-        t.depth = meetings.depth(pair, r, s, balance.now, t.center, t.solid), t.holding = V(0);
+        const V sunk = meetings.depth(pair, r, s, balance.now, t.center, t.solid);
+        t.depth = sunk + s.bounce, t.holding = V(0);
         meetings.touch(pair, r, s, t);
         Force<V, D> found;
         force<typename decltype(pair)::Support>(t, found);
         const int g = bodies.group[r];
         for (int i = 0; i < count; i++)
           if (lane(s.there, i) > T(0)) show(i, roster.meeting_slot[g] + int(lane(s.slot, i)), t, found);
-        const M far = (t.depth > V(0)) & meetings.turned_far(r);
+        const M far = (sunk > V(0)) & meetings.turned_far(r);
         const V deep = V(meetings.slots.laws(r)[2]);
-        strained(t.depth / deep + select(far, V(1), V(0)), roster.meeting_danger[g] + bodies.danger[r]);
+        strained(sunk / deep + select(far, V(1), V(0)), roster.meeting_danger[g] + bodies.danger[r]);
       });
     });
   }

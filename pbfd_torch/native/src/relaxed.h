@@ -14,7 +14,7 @@ template <class V> struct Relaxed {
   void none() { width = firmness = length = V(1), lagged = typename Kind<V>::Mask(false), lagging = false; }
 
   V holding(int i) const { return lagging ? select(lagged, held[i], V(0)) : V(0); }
-  // From the normal force of the depth, and its slope, to what friction feels of them.
+  // From the normal force of the depth (or the depth itself), and its slope, to what friction feels of them.
   void felt(V holding, V& push, V& rises) const {
     if (!lagging) return;
     push = select(lagged, holding, push), rises = select(lagged, V(0), rises);

@@ -4,10 +4,17 @@
 
 namespace pbfd {
 
-// N and dN/dd at depth d in a step that began at d₀; `per_range`: 1 / (release speed × Δt).
+// How much of it is left at depth d in a step that began at d₀, and how that rises; `per_range`: 1 / (release speed × Δt).
+template <class V> inline void released(V depth, V start, V per_range, V& share, V& rises) {
+  const V x = clamped(fma(depth - start, per_range, V(1)), V(0), V(1));
+  share = x * x * fma(V(-2), x, V(3)), rises = V(6) * x * (V(1) - x) * per_range;
+}
+
+// N and dN/dd.
 template <class V> inline void release_law(V stiffness, V depth, V start, V per_range, V& push, V& slope) {
-  const V d = max(depth, V(0)), x = clamped(fma(depth - start, per_range, V(1)), V(0), V(1));
-  const V whole = stiffness * d * d, share = x * x * fma(V(-2), x, V(3)), falls = V(6) * x * (V(1) - x) * per_range;
+  V share, falls;
+  released(depth, start, per_range, share, falls);
+  const V d = max(depth, V(0)), whole = stiffness * d * d;
   push = share * whole;
   slope = fma(share * V(2), stiffness * d, falls * whole);
 }

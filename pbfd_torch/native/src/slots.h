@@ -2,7 +2,7 @@
 // same rows for all.
 #pragma once
 #include "branches.h"
-#include "facets.h"
+#include "curved.h"
 #include "finder.h"
 
 namespace pbfd {
@@ -18,6 +18,7 @@ template <class V, class N, int D> struct Slots {
   Coupling coupling;
   bool changed = true;  // J couples other bodies than when it was last asked
   Poses<V> before;      // of the nodes, at the start of the step
+  const V* behind = nullptr;  // what anchors remember
   V* reach;             // [groups × links] how far colliders may move without one being missed
   V dropped;            // 1 where more was near than is kept
   Spot<V>* spot;        // [rows × SPOTS]
@@ -80,8 +81,23 @@ template <class V, class N, int D> struct Slots {
     for (int j = 0; j < 3; j++) out[j] += position(at, bodies.first[row])[j];
   }
   const T* solid(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + 1; }
+  const T* own_frames(int row) const { return bodies.of_row + NUMBERS_OF_A_ROW * row + OWN_FRAMES; }
   T radius(int row) const { return bodies.of_row[NUMBERS_OF_A_ROW * row]; }
+  Curved<T> curved(int row) const { return {bodies.of_row + NUMBERS_OF_A_ROW * row}; }
+  Standing<V> standing(Poses<V> at, int node) const { return {rotation(at, node), position(at, node)}; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
+
+  // How deep a candidate is at a point as the solid's body sees it.
+  V depth(int row, const Spot<V>& s, const V* own) const {
+    Beside<V, 3> beside;
+    switch (bodies.meeting[row]) {
+      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
+      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
+      default: Face::beside(s, solid(row), own, beside);
+    }
+    return V(radius(row)) - beside.distance;
+  }
 
   // Where a candidate of a group is in a lane.
   int* slot(int group, int i, int which) const {
@@ -100,6 +116,8 @@ template <class V, class N, int D> struct Slots {
         case BALL_ON_PILL: visit(Pair<Guarded<Pill>, Ball>(), r); break;
         case BALL_ON_BLOCK: visit(Pair<Guarded<Block>, Ball>(), r); break;
         case BALL_ON_DRUM: visit(Pair<Guarded<Drum>, Ball>(), r); break;
+        case RIM_ON_FACE: visit(Pair<Face, Ellipsoid>(), r); break;
+        case ROUND_ON_ROUND: visit(Pair<Near, Approaching>(), r); break;
       }
     }
   }
@@ -138,11 +156,34 @@ template <class V, class N, int D> struct Slots {
         const int at = g * bodies.links + l;
         put(reach[at], i, finder.reach[at] = finder.reach_of_free_motion(g, l));
       }
-      more = finder.find(g, sorted) || more;
+      more = finder.find(g, sorted || bodies.memory[g] >= 0) || more;
       found[W * g + i] = finder.count;
-      for (int c = 0; c < finder.count; c++) put(spot[*slot(g, i, c) = settle(i, finder.found[finder.order[c]])].slot, i, T(c));
+      for (int c = 0; c < finder.count; c++) {
+        const Found<T>& one = finder.found[finder.order[c]];
+        Spot<V>& s = spot[*slot(g, i, c) = settle(i, one)];
+        put(s.slot, i, T(c));
+        if (bodies.memory[g] >= 0) inherit(g, i, one, s);
+      }
     }
     put(dropped, i, T(more));
+  }
+  // What the anchor is behind by of the nearest candidate of the same pair in the step before.
+  void inherit(int g, int i, const Found<T>& one, Spot<V>& s) const {
+    const T* frames = own_frames(one.row);
+    T nearest(HUGE_VAL), x[3], off[3], kept[3] = {}, anchor[3];
+    for (int j = 0; j < 3; j++) off[j] = one.position[j] - frames[9 + j];
+    transposed_times(frames, off, x);
+    for (int m = 0; m < bodies.kept[g]; m++) {
+      const V* memory = behind + bodies.memory[g] + NUMBERS_OF_AN_ANCHOR * m;
+      if (lane(memory[6], i) != T(bodies.danger[one.row])) continue;
+      for (int j = 0; j < 3; j++) off[j] = x[j] - lane(memory[3 + j], i);
+      const T distance = dot(off, off);
+      if (!(distance < nearest)) continue;
+      nearest = distance;
+      for (int j = 0; j < 3; j++) kept[j] = lane(memory[j], i);
+    }
+    times(frames + 12, kept, anchor);
+    for (int j = 0; j < 3; j++) put(s.anchor[j], i, anchor[j]);
   }
   void copy(Poses<V> from, int k, int i, Pose<T>& to) const {
     for (int j = 0; j < 9; j++) to.rotation[j] = lane(rotation(from, k)[j], i);
@@ -156,6 +197,11 @@ template <class V, class N, int D> struct Slots {
     if (place >= most[c.row]) s.clear(), most[c.row] = place + 1;  // no lane has had it
     put(s.there, i, T(1)), put(s.offset, i, c.offset), put(s.passed, i, T(c.passed)), put(s.near, i, T(c.near));
     for (int j = 0; j < 3; j++) put(s.position[j], i, c.position[j]), put(s.normal[j], i, c.normal[j]);
+    if (bodies.meeting[c.row] >= CURVED) {
+      put(s.rim, i, T(c.rim)), put(s.lying, i, T(c.lying)), put(s.follows, i, T(c.follows));
+      for (int j = 0; j < 2; j++) put(s.swept[j], i, T(c.swept[j]));
+      for (int j = 0; j < 3; j++) put(s.other[j], i, c.other[j]);
+    }
     return at;
   }
 
@@ -184,20 +230,20 @@ template <class V, class N, int D> struct Slots {
     for (int j = 0; j < 3; j++) own[j] = V(laws(row)[5 + j]);
     times(runs >= plan.nodes ? rotation(before, runs) : still, own, belt);
     transposed_times(rotation(before, bodies.second[row]), belt, ran);
-    s.began = depth(row, s, s.start);
+    s.began = bodies.meeting[row] < CURVED ? depth(row, s, s.start) : curved_depth(row, s, c);
     for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);
   }
 
-  // At a point as the solid's body sees it.
-  V depth(int row, const Spot<V>& s, const V* own) const {
-    Beside<V, 3> beside;
-    switch (bodies.meeting[row]) {
-      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
-      default: Face::beside(s, solid(row), own, beside);
-    }
-    return V(radius(row)) - beside.distance;
+  // Of a curved body, and which part of its normal force it gives in this step.
+  V curved_depth(int row, Spot<V>& s, const V* c) const {
+    const Standing<V> one = standing(before, bodies.first[row]), other = standing(before, bodies.second[row]);
+    Beside<V, 3> plane;
+    V axis[3];
+    Face::beside(s, solid(row), s.start, plane);
+    times(other.rotation, s.normal, plane.normal), times(one.rotation, curved(row).axis(), axis);
+    s.share = Ellipsoid::share(s.lying, dot(axis, plane.normal));
+    return bodies.meeting[row] == ROUND_ON_ROUND ? sunk<Approaching>(s, curved(row), one, other, c, plane)
+                                                 : sunk<Ellipsoid>(s, curved(row), one, other, c, plane);
   }
 };
 

@@ -41,15 +41,15 @@ template <class V, class N, int D, class Scheme> struct Starts {
     T* back = static_cast<T*>(others[0]);
     const V dt = V(T(rules.dt));
     for (int i = 0; i < plan.nv; i++) before.acceleration[i] = V(0);
-    for (int i = 0; i < 3 * plan.anchors; i++) before.behind[i] = begun.behind[i] = V(0);
+    for (int i = 0; i < plan.remembered(); i++) before.behind[i] = begun.behind[i] = V(T(i < 3 * plan.anchors ? 0 : -1));
     each_block(first, last, [&] {
       take(q, plan.nq, before.q), take(speeds, plan.nv, v);
       retract(plan, before.q, v, -dt, before.q_previous);
       give(before.q_previous, plan.nq, back), give(before.acceleration, plan.nv, static_cast<T*>(others[1]));
-      give(before.behind, 3 * plan.anchors, static_cast<T*>(others[2]));
+      give(before.behind, plan.remembered(), static_cast<T*>(others[2]));
     });
     machine.run(trial, rules, first, last);
-    balance.dt = dt, balance.relaxed.none(), balance.contacts.behind = before.behind;
+    balance.dt = dt, balance.relaxed.none(), balance.recall(before.behind);
     each_block(first, last, [&] {
       take(q, plan.nq, before.q), take(speeds, plan.nv, v), take(back, plan.nq, before.q_previous);
       for (int i = 0; plan.moving > 0 && i < W; i++)

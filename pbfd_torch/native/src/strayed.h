@@ -26,7 +26,7 @@ template <class V, class N, int D> struct Sight {
   M pushes(const Balance<V, N, D>& b, const V* q) {
     look(q);
     M found(false);
-    b.each_normal_force(there, [&](int, V force) { found = found | (force > V(0)); });
+    b.each_normal_force(there, [&](int, V force, V) { found = found | (force > V(0)); });
     forces_of<LIMITS>(b, q, turned, slopes);
     for (int i = 0; i < plan.nv; i++) found = found | (abs(turned[i]) > V(0));
     return found;

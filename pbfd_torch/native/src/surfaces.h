@@ -8,9 +8,10 @@
 
 namespace pbfd {
 
-// A point beside a solid: its signed distance φ, > 0 outside, the direction n of ∇φ, and ‖∇φ‖ where φ is not the distance itself.
+// A point beside a solid: its signed distance φ, > 0 outside, the direction n of ∇φ, and ‖∇φ‖ where φ is not the distance itself; how
+// far along its axis the nearest point of a swept body lies [m] (curved.h).
 template <class V, int D> struct Beside {
-  V distance, normal[D], steepness;
+  V distance, normal[D], steepness, slide;
 };
 
 // A half-space.

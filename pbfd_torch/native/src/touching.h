@@ -4,10 +4,8 @@
 // What moves is told by (ω, w), w the velocity of the centre: n answers with B w, s and h as supports.h says, the depth with
 // −δd = ‖∇φ‖ n·w − δh.
 #pragma once
-#include "friction.h"
+#include "laws.h"
 #include "loads.h"
-#include "relaxed.h"
-#include "release.h"
 #include "supports.h"
 #include "surfaces.h"
 
@@ -20,7 +18,8 @@ template <class V, int D> struct Touching {
   Arm<V, D> arm;
   V depth, start;          // at the end of the step and at its beginning
   V firmness, grip, per_range, per_width;  // C⊥, μ; 1 / (release speed × Δt) and 1/ε
-  V holding;                               // the normal force that friction feels, where it is lagged
+  V holding;                               // what friction feels where it is lagged, see `Law`
+  const Law<V>* law;                       // null: the usual one
   const Relaxed<V>* relaxed;
   const V *turn, *rolling;  // ϕ, and how it answers ω; null where nothing rolls
 
@@ -37,9 +36,10 @@ template <class V, int D> struct Touching {
   }
 };
 
-// m and its part along n, u, p and f; N of the depth, what friction feels of it, and how both rise; the drag G and what it is made of.
+// m and its part along n, u, p and f; N and ∂N/∂d; and what holds it, which is in N already.
 template <class V, int D> struct Force {
-  V m[D], lifted, u[D], p[D], f[D], push, rises, pressed, firmer, factor, falls, drag;
+  V m[D], lifted, u[D], p[D], f[D], push, rises;
+  Grasp<V> grasp;
 };
 
 template <class Support, class V, int D> inline void force(const Touching<V, D>& t, Force<V, D>& out) {
@@ -47,12 +47,10 @@ template <class Support, class V, int D> inline void force(const Touching<V, D>&
   t.template travel<Support>(out.m);
   out.lifted = dot<D>(out.m, n);
   for (int j = 0; j < D; j++) out.u[j] = fma(-out.lifted, n[j], out.m[j]), out.p[j] = Support::rolls ? c[j] + s[j] : c[j];
-  release_law(t.firmness, t.depth, t.start, t.per_range, out.push, out.rises);
-  slip_law(sqrt(dot<D>(out.u, out.u)), t.per_width, out.factor, out.falls);
-  out.pressed = out.push, out.firmer = out.rises;
-  t.relaxed->felt(t.holding, out.pressed, out.firmer);
-  out.drag = t.grip * out.pressed * out.factor;
-  for (int j = 0; j < D; j++) out.f[j] = fma(out.push, n[j], -(out.drag * out.u[j]));
+  normal_force(t.law, t.firmness, t.depth, t.start, t.per_range, out.push, out.rises);
+  friction(t.law, *t.relaxed, t.grip, t.per_width, t.holding, out.push, out.rises, t.depth, sqrt(dot<D>(out.u, out.u)), out.grasp);
+  out.push += out.grasp.lift, out.rises += out.grasp.lift_by_depth;
+  for (int j = 0; j < D; j++) out.f[j] = fma(out.push, n[j], -(out.grasp.drag * out.u[j]));
 }
 
 // `FLAT`: the normal does not turn, and the depth is the distance itself.
@@ -61,12 +59,13 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
   const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
   Force<V, D> at;
   force<Support>(t, at);
-  const V *m = at.m, *u = at.u, *p = at.p, *f = at.f, lifted = at.lifted, push = at.push, rises = at.rises, drag = at.drag;
-  const V by_depth = t.grip * at.firmer * at.factor, by_size = t.grip * at.pressed * at.falls;
+  const V *m = at.m, *u = at.u, *p = at.p, *f = at.f, lifted = at.lifted, push = at.push, rises = at.rises, drag = at.grasp.drag;
+  const V by_depth = at.grasp.by_depth, by_size = at.grasp.by_size, lifts = at.grasp.lift_by_size;
 
   // answers: −δf of a motion that makes the slip grow by `slips` and the depth fall by `sinks`, but for what the normal's turn does
   auto answer = [&](const V* slips, V sinks, V* a) {
-    const V resists = fma(by_size, dot<D>(u, slips), -(by_depth * sinks)), presses = rises * sinks;
+    const V grows = dot<D>(u, slips);
+    const V resists = fma(by_size, grows, -(by_depth * sinks)), presses = fma(-lifts, grows, rises * sinks);
     for (int j = 0; j < D; j++) a[j] = fma(n[j], presses, fma(drag, slips[j], u[j] * resists));
   };
   V by_turn[S * T], by_shift[S * D];  // of the torque about the world's origin and of the force
@@ -100,7 +99,7 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
     V carried[D * T];  // a material point at p would move by ω × s
     arms<D>(s, carried);
     for (int b = 0; b < T; b++) {  // ω
-      V column[T], slips[D], a[D], wandered[D], sinks = zero;
+      V column[T], slips[D], a[D], wandered[D], tilt[D], sinks = zero;
       for (int j = 0; j < T; j++) column[j] = t.rolling[T * j + b];
       for (int j = 0; j < D; j++) wandered[j] = -carried[T * j + b];
       swing<D>(column, s, slips);
@@ -110,9 +109,15 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
         add_swing<D>(t.turn, shifted, slips);
         sinks = -t.arm.reach_by_turn[b];
       }
-      const V along = dot<D>(n, slips);
-      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], slips[j]);
+      V along = dot<D>(n, slips);
+      if constexpr (Support::leans) {
+        for (int j = 0; j < D; j++) tilt[j] = t.arm.tilt[T * j + b];
+        along += dot<D>(m, tilt);
+      }
+      for (int j = 0; j < D; j++) slips[j] = fma(-along, n[j], Support::leans ? fma(-lifted, tilt[j], slips[j]) : slips[j]);
       answer(slips, sinks, a);
+      if constexpr (Support::leans)
+        for (int j = 0; j < D; j++) a[j] = fma(-push, tilt[j], a[j]);
       wrench(b, T, a, wandered, by_turn);
     }
   }
