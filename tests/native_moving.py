@@ -45,6 +45,7 @@ MOTIONS: dict[str, Motion] = {
     "rocking": Rocking(),
 }
 SCHEMES: tuple[Any, ...] = (EnergyMomentum(), ImplicitEuler(), Variational(), Bdf2())
+TABLE = Box((0.6, 0.5, 0.1))
 TURNED = (0.98, 0.1, -0.12, 0.1)
 
 
@@ -89,10 +90,7 @@ def timed(state: Any, time: Tensor) -> Any:
     return replaced(state, time=time.to(state.time.dtype))
 
 
-SLAB = Box((0.6, 0.5, 0.1))
-
-
-def table(motion: Motion, shape: Solid = SLAB, position: Any = (0.0, 0.0, -0.1), turn: Any = TURNED) -> Obstacle:
+def table(motion: Motion, shape: Solid = TABLE, position: Any = (0.0, 0.0, -0.1), turn: Any = TURNED) -> Obstacle:
     """An obstacle that moves."""
     return Obstacle("table", shape, position, turn, motion)
 

@@ -22,6 +22,7 @@ from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import retract
 from tests.native_moving import MOTIONS, SCHEMES, crowd, drawn, laid, riding, thrown, timed
 from tests.native_parity import DT, fields, require_balance, resting
@@ -74,6 +75,19 @@ def test_anchors_are_carried_along(solid: str, kind: Any, motion: str) -> None:
     after, solution, _ = native.made(state, None)
     assert require_kept(native, state, None, after, solution) >= 15
     assert max(float(x.abs().max()) for x in after.memory) > 1e-4
+
+
+@pytest.mark.parametrize(("solid", "kind"), BESIDE)
+def test_what_is_thrown_back(solid: str, kind: Any) -> None:
+    """By how fast it meets the solid as that moves."""
+    moving = placed((PLANE | SOLIDS)[solid], 60, MOTIONS["rocking"])
+    scene = touching(BALLS if kind is Contact else CURVED, (moving, GROUND), kind)
+    terms = [dataclasses.replace(x, restitution=Restitution(0.5)) if isinstance(x, Contact) else x for x in scene.terms]
+    scene = dataclasses.replace(scene, terms=terms)
+    state, q = beside(scene, 60, speed=1.0, time=drawn(60, seed=5) + 1)
+    objective = Simulator(scene, DT).eager.objective(state)
+    assert any(bool((x.bounce > 0).any()) for x in objective.prepared if x is not None and getattr(x, "bounce", None) is not None)
+    require_balance(scene, state, q)
 
 
 @pytest.mark.parametrize("solid", CONVEX)

@@ -181,7 +181,7 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         nodes=_nodes(a),
         gravity=stepper.scene.gravity,
         candidates=known.candidates,
-        bodies=(bodies := Bodies.of(a, known.meetings, known.candidates.laws, known.carriers, 3 * sum(known.candidates.anchors))),
+        bodies=(bodies := Bodies.of(a, known.meetings, known.carriers, known.candidates.laws, 3 * sum(known.candidates.anchors))),
         carriers=known.carriers,
         driven=driven,
         pushed=known.pushed,

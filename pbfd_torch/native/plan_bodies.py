@@ -70,9 +70,9 @@ class Bodies:
     remembered: int = 0
 
     @classmethod
-    def of(cls, a: Articulation, terms: Sequence[BodyContact], laws: Laws, carriers: Carriers, before: int) -> Bodies:
-        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws, and the obstacles
-        that move to the carriers. Raises `NotCompiledError`."""
+    def of(cls, a: Articulation, terms: Sequence[BodyContact], carriers: Carriers, laws: Laws, before: int) -> Bodies:
+        """Of the terms of a scene, where other contacts remember so many numbers `before` these; adds their laws, and what carries
+        their obstacles. Raises `NotCompiledError`."""
         frames, nodes = a.link_frame, [node - 1 for node in a.topology.link_node]
         obstacles = list(terms[0].obstacles) if terms else []
         eye = torch.eye(4, dtype=a.dtype)

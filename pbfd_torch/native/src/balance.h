@@ -31,8 +31,8 @@ template <class V, class N, int D = 3> struct Balance {
   V *axes, *chord_axes, *chord, *residual, *slopes, *matrix;
   Pull<V, D>* pulls;
   Push<V, D>* pushes;
-  Laws<V, N, D> laws;
   Carriers<V> carriers;
+  Laws<V, N, D> laws;
   Contacts<V, N, D> contacts;
   Meetings<V, N, D> meetings;
 
@@ -40,7 +40,8 @@ template <class V, class N, int D = 3> struct Balance {
   static int room(Sizes s) {  // in V, for the arena
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
            in_registers<Push<V, D>>(s.nodes) + Laws<V, N, D>::room(s) + Contacts<V, N, D>::room(s) +
-           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu + (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
+           Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
+           (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
   template <class X> static X* taken(Arena<V>& arena, int count) {
@@ -48,7 +49,7 @@ template <class V, class N, int D = 3> struct Balance {
   }
 
   Balance(const Plan<N, D>& scene, Arena<V>& arena)
-      : plan(scene), laws(scene, relaxed, arena), carriers(scene, arena), contacts(scene, relaxed, laws, carriers, arena),
+      : plan(scene), carriers(scene, arena), laws(scene, relaxed, arena), contacts(scene, relaxed, laws, carriers, arena),
         meetings(scene, relaxed, laws, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);

@@ -67,14 +67,15 @@ template <class V, class N, int D> struct Contacts {
       for (int i = first; i < last; i++) {
         const Law<V>* law = laws.at(candidates.law[i]);
         if (!law || !law->throws()) continue;
+        V c[D];
+        Beside<V, D> solid;
+        const V start = -began(pair, i, c, solid);
         auto gap = [&](Poses<V> at) {
-          V c[D];
-          Beside<V, D> solid;
           center(i, at, c);
           return -depth(pair, i, at, c, solid);
         };
         V& out = bounce[candidates.law[i]];
-        out = select(anew, law->bounce(gap(before), gap(free), gap(laws.coasting), step), out);
+        out = select(anew, law->bounce(start, gap(free), gap(laws.coasting), step), out);
       }
     });
   }

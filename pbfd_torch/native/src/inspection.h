@@ -4,8 +4,8 @@
 
 namespace pbfd {
 
-// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. behind: what anchors remember; `from`, `to`:
-// where the obstacles that move begin and end.
+// r [nv] and J [nv × nv] at a configuration of the step from q with v under a control. behind: what anchors remember;
+// `from`, `to`: where the obstacles that move begin and end.
 template <class T, int D>
 inline void inspect(const Plan<T, D>& plan, const T* behind, const T* q, const T* v, const T* control, const T* at, T dt,
                     const T* from, const T* to, Arena<T> arena, T* residual, T* matrix) {

@@ -132,7 +132,7 @@ template <class V, class N, int D> struct Laws {
   // It would lead to `free` without contacts.
   void coast(Poses<V> free, V dt) {
     if (!throwing) return;
-    coasting.rotation = free.rotation;
+    coasting.rotation = free.rotation, coasting.carriers = free.carriers;
     for (int i = 0; i < D * plan.nodes; i++) coasting.position[i] = fma(-(dt * dt), V(plan.gravity[i % D]), free.position[i]);
   }
 
