@@ -6,6 +6,8 @@ they know nothing of Python and torch. Where that fails the installation goes on
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import logging
 import os
 import platform
@@ -43,6 +45,9 @@ FLAGS = [
 # For continuous integration: warnings are errors, and errors stop the installation.
 STRICT = os.environ.get("PBFD_NATIVE_STRICT", "") not in ("", "0")
 
+# A folder that keeps what has been compiled: of the same sources by the same command it is taken from there.
+CACHE = os.environ.get("PBFD_NATIVE_CACHE", "")
+
 
 def compiler() -> list[str]:
     """The command that compiles C++, `CXX` or one that is found; empty where there is none."""
@@ -54,12 +59,29 @@ def compiled(file: Path, flags: list[str]) -> str:
     """Compiles one variant of the core into `file`; what the compiler said against it, or nothing."""
     given = shlex.split(os.environ.get("CXXFLAGS", "")), shlex.split(os.environ.get("LDFLAGS", ""))
     strict = ["-Werror"] if STRICT else []
-    command = [*compiler(), *FLAGS, *flags, *strict, *given[0], "-o", str(file), str(SOURCES / "library.cpp"), *given[1]]
+    command = [*compiler(), *FLAGS, *flags, *strict, *given[0], str(SOURCES / "library.cpp"), *given[1]]
+    kept = Path(CACHE, digest(command) + ".so") if CACHE else None
+    if kept is not None and kept.exists():
+        shutil.copy(kept, file)
+        return ""
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        ran = subprocess.run([*command, "-o", str(file)], capture_output=True, text=True, check=False)
     except OSError as error:
         return f"{command[0]}: {error.strerror}"
+    if ran.returncode == 0 and kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, kept)
     return "" if ran.returncode == 0 else f"{command[0]} failed: {ran.stderr.strip() or f'exit status {ran.returncode}'}"
+
+
+def digest(command: list[str]) -> str:
+    """Of a command, its compiler and all sources."""
+    found = hashlib.sha256(shlex.join(command).encode())
+    with contextlib.suppress(OSError):  # it is going to be said when it compiles
+        found.update(subprocess.run([*compiler(), "--version"], capture_output=True, check=False).stdout)
+    for source in sorted(SOURCES.iterdir()):
+        found.update(source.name.encode() + source.read_bytes())
+    return found.hexdigest()
 
 
 class BuildNative(build_ext):
