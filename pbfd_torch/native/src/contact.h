@@ -67,20 +67,18 @@ template <class V, class N, int D> struct Contacts {
       for (int i = first; i < last; i++) {
         const Law<V>* law = laws.at(candidates.law[i]);
         if (!law || !law->throws()) continue;
-        V c[D];
-        Beside<V, D> solid;
-        const V start = -began(pair, i, c, solid);
-        auto gap = [&](Poses<V> at) {
-          center(i, at, c);
-          return -depth(pair, i, at, c, solid);
-        };
-        V& out = bounce[candidates.law[i]];
-        out = select(anew, law->bounce(start, gap(free), gap(laws.coasting), step), out);
+        V gap[3], c[D], &out = bounce[candidates.law[i]];
+        const Poses<V> at[] = {before, free, laws.coasting};
+        for (int k = 0; k < 3; k++) {
+          Beside<V, D> solid;
+          center(i, at[k], c), gap[k] = -depth(pair, i, at[k], c, solid);
+        }
+        out = select(anew, law->bounce(gap[0], gap[1], gap[2], step), out);
       }
     });
   }
   // How far the solid of a candidate is moved out.
-  V moved_out(int i) const {
+  [[gnu::noinline]] V moved_out(int i) const {
     const Law<V>* law = laws.throwing ? laws.at(candidates.law[i]) : nullptr;
     return law && law->throws() ? bounce[candidates.law[i]] : V(0);
   }
@@ -283,7 +281,7 @@ template <class V, class N, int D> struct Contacts {
   // Scenes with anchors are seen in space.
   bool anchored(int i) const { return D == 3 && candidates.anchor[i] >= 0; }
 
-  V harder(int i, V firmness) const {
+  [[gnu::noinline]] V harder(int i, V firmness) const {
     const Law<V>* law = laws.at(candidates.law[i]);
     return law && law->throws() ? law->harder(firmness, bounce[candidates.law[i]]) : firmness;
   }

@@ -39,7 +39,7 @@ template <class V> struct Law {
     return select(bounces, gap + V(0.5) * (root - pull), zero);
   }
   // What gives way is lost to the rebound.
-  V harder(V stiffness, V bounce) const {
+  [[gnu::noinline]] V harder(V stiffness, V bounce) const {
     return stiffness * select(bounce > V(0), V(power(T(HARDER), exponent)), V(1));
   }
 
@@ -53,8 +53,8 @@ template <class V> struct Law {
   }
 
   // Of other friction than Coulomb's; `holding`: see `feels`.
-  [[gnu::noinline]] void hold(const Relaxed<V>& relaxed, V mu, V per_width, V holding, V push, V rises, V depth, V size,
-                              Grasp<V>& out) const {
+  [[gnu::noinline]] Grasp<V> hold(const Relaxed<V>& relaxed, V mu, V per_width, V holding, V push, V rises, V depth, V size) const {
+    Grasp<V> out;
     const V zero(0), per_size = select(size > zero, V(1) / select(size > zero, size, V(1)), zero);
     out.lift = out.lift_by_depth = out.lift_by_size = zero;
     if (manner == STATIC) {
@@ -64,7 +64,7 @@ template <class V> struct Law {
       const V x = max(size - V(1) / per_width, zero) * per_fall, more = excess * exponential(-(x * x));
       const V all = mu + more, slope = fma(falls, all, -(factor * V(2) * x * more * per_fall * per_size));
       out.drag = push * factor * all, out.by_depth = rises * factor * all, out.by_size = push * slope;
-      return;
+      return out;
     }
     V deepens(1), deep = depth;
     if (manner == PAPER) relaxed.felt(holding, deep, deepens);
@@ -72,10 +72,11 @@ template <class V> struct Law {
     out.drag = mu * power(d, sunk + T(1)) * slips;
     out.by_depth = deepens * (V(sunk + T(1)) * mu * power(d, sunk) * slips);
     out.by_size = V(slip) * out.drag * per_size * per_size;
-    if (manner != GRADIENT) return;
+    if (manner != GRADIENT) return out;
     const V stiffness = V((sunk + T(1)) / (slip + T(2))) * mu, further = slips * size * size;  // y^(β+1)
     out.lift = stiffness * power(d, sunk) * further, out.lift_by_size = out.by_depth;
     out.lift_by_depth = select(deep > zero, V(sunk) * stiffness * power(d, sunk - T(1)) * further, zero);
+    return out;
   }
 
   // What friction feels where it is lagged: the normal force or the depth, or nothing, as it follows the slip alone.
@@ -86,16 +87,21 @@ template <class V> inline bool squared(const Law<V>* law) { return !law || law->
 
 template <class V>
 inline void normal_force(const Law<V>* law, V stiffness, V depth, V start, V per_range, V& push, V& slope) {
-  if (squared(law))
-    release_law(stiffness, depth, start, per_range, push, slope);
-  else
-    law->press(stiffness, depth, start, per_range, push, slope);
+  if (squared(law)) return release_law(stiffness, depth, start, per_range, push, slope);
+  V found, rises;  // of their own, so that no register has to be in memory for them
+  law->press(stiffness, depth, start, per_range, found, rises);
+  push = found, slope = rises;
 }
 
 template <class V>
 inline void friction(const Law<V>* law, const Relaxed<V>& relaxed, V mu, V per_width, V holding, V push, V rises, V depth, V size,
                      Grasp<V>& out) {
-  if (law && law->manner != COULOMB) return law->hold(relaxed, mu, per_width, holding, push, rises, depth, size, out);
+  if (law && law->manner != COULOMB) {
+    const Grasp<V> other = law->hold(relaxed, mu, per_width, holding, push, rises, depth, size);
+    out.drag = other.drag, out.by_depth = other.by_depth, out.by_size = other.by_size;
+    out.lift = other.lift, out.lift_by_depth = other.lift_by_depth, out.lift_by_size = other.lift_by_size;
+    return;
+  }
   V factor, falls;
   slip_law(size, per_width, factor, falls);
   relaxed.felt(holding, push, rises);
