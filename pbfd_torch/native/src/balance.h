@@ -53,7 +53,7 @@ template <class V, class N, int D = 3> struct Balance {
         meetings(scene, relaxed, laws, arena) {
     start = Poses<V>::template in<D>(arena, plan), target = Poses<V>::template in<D>(arena, plan);
     now = Poses<V>::template in<D>(arena, plan);
-    start.carriers = carriers.start, target.carriers = now.carriers = carriers.end;
+    start.carriers = carriers.start, target.carriers = now.carriers = laws.coasting.carriers = carriers.end;
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
     fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan));
