@@ -100,14 +100,14 @@ def stepper(scene: Scene, dt: float = 0.01, scheme: Any = None) -> NativeStepper
     return NativeStepper(Simulator(scene, dt, scheme).eager)
 
 
-def crowd(motion: Motion, shapes: Sequence[Shape], worlds: int = 0) -> Scene:
+def crowd(motion: Motion, shapes: Sequence[Shape], worlds: int = 0, friction: FrictionLaw | None = None) -> Scene:
     """Bodies on a table that moves, beside obstacles that move in another way and one that does not. worlds: where the table begins
     elsewhere in each."""
     block = Obstacle("block", Box((0.2, 0.2, 0.1)), (0.3, 0.2, 0.0), motion=Lift.steady((-0.5, 0.3, 0.2)))
     wheel = Obstacle("wheel", Box((0.15, 0.2, 0.1)), (-0.3, -0.1, 0.0), motion=Turntable(2.0, (0.0, 1.0, 0.3), (-0.3, 0.0, 0.0)))
     still = Obstacle("still", Box((0.1, 0.1, 0.1)), (0.0, 0.3, 0.0))
     own = (0.1 * drawn(worlds, 3, seed=8) + torch.tensor([0.0, 0.0, -0.1]),) if worlds else ()
-    return over(shapes, (table(motion, Box((0.6, 0.5, 0.1)), *own), block, wheel, still))
+    return over(shapes, (table(motion, Box((0.6, 0.5, 0.1)), *own), block, wheel, still), friction)
 
 
 def riding(

@@ -10,20 +10,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from pbfd_torch import Scene, Simulator
+from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.motion import Motion
+from pbfd_torch.contact.motion import Motion, Turntable
+from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.shapes import Box, Collider, Sphere
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
+from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Native
 from pbfd_torch.native.library import library
-from pbfd_torch.native.stepper import NativeStepper
+from pbfd_torch.native.stepper import NativeStepper, uncovered
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.tensors.worlds import Worlds
+from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.inertia import Inertia
+from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
-from pbfd_torch.tree.kinematics import retract
+from pbfd_torch.tree.kinematics import place, retract
+from tests.bodies import diagonal
 from tests.native_moving import MOTIONS, SCHEMES, crowd, drawn, laid, riding, thrown, timed
 from tests.native_parity import DT, fields, require_balance, resting
 from tests.native_parity import begun as begun_from
@@ -244,3 +252,49 @@ def test_no_world_knows_another(motion: str, shapes: str, dtype: torch.dtype, sc
     alike = state.take(Worlds((worlds,), torch.full((worlds,), 4)))
     some, solved = native.run(alike, None, steps)
     require_equal(some, states, solved, solution, torch.full((worlds,), 4))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_anchors_between_bodies(motion: str) -> None:
+    """Bodies stick to what carries them: r, J, and what is remembered after a step."""
+    scene = crowd(MOTIONS[motion], SHAPES["boxes"], friction=AnchoredFriction(1.0, 1e-3))
+    native = NativeStepper(Simulator(scene, DT).eager)
+    q, v = thrown(scene, 24)
+    before = native.complete(timed(resting(q, v), drawn(24, seed=2) + 1))
+    after, solution, _ = native.made(before, None)
+    whole = solution.solved & (solution.status != int(Status.HALVED))
+    assert int(whole.sum()) >= 15
+    kept = native.eager.objective(before, None).aftermath(place(scene.articulation, after.q)).memory
+    for ours, theirs in zip(after.memory, kept, strict=True):
+        assert torch.equal(ours[whole][..., 6], theirs[whole][..., 6])
+        held = whole[:, None] & (theirs[..., 6] >= 0)
+        assert torch.allclose(ours[held], theirs[held], rtol=0, atol=1e-12)
+        assert float(ours[held][:, :3].abs().max()) > 1e-4
+    require_balance(scene, after, retract(scene.articulation, after.q, DT * after.v))
+
+
+@pytest.mark.parametrize("name", ["conveyor", "turntable"])
+def test_named_scenes(name: str) -> None:
+    """They are compiled, and boxes do what these scenes are about."""
+    setup = SCENES[name](worlds=2)
+    simulator = Simulator(setup.scene, setup.dt, engine=Native())
+    rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), steps=round(setup.duration / setup.dt))
+    assert bool(rollout.solved.all())
+    found = setup.report(setup, rollout)
+    if name == "conveyor":
+        assert max(map(abs, found["slip_back_error"])) < 0.02
+    else:
+        assert max(found["inner_drift_m"]) < 0.02
+        assert min(found["outer_distance_m"]) > 0.62
+
+
+def test_what_is_not_covered_is_said() -> None:
+    """What rides on the world and is touched by what moves: its record would change."""
+    fixed = Link("fixed", position=(0.0, 0.0, 0.1))
+    a = Articulation.from_links([fixed, Link("free", joints=(Joint("f", JointKind.FREE),), mass=1.0, inertia=diagonal(1, 1, 1))])
+    colliders = [Collider(name, name, Sphere(0.1)) for name in ("fixed", "free")]
+    solid = Obstacle("table", Box((1.0, 1.0, 0.1)), motion=Turntable(1.0))
+    contact = Contact.between(a, colliders, solid, NormalForce(1e5), CoulombFriction(0.7))
+    scene = Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
+    words = "the core does not know what does not move against 'table', which does"
+    assert uncovered(Simulator(scene, DT).eager) == words
