@@ -116,7 +116,7 @@ def test_steps_with_the_world(law: str, geometry: str) -> None:
     state, _ = beside(scene, 24, 5)
     require_steps(scene, state)
     require_starts(scene, state.q, state.v)
-    require_fallbacks_alike(scene, state.q, state.v, 2)
+    require_fallbacks_alike(scene, state.q, state.v)
     require_records(scene, state.q, state.v)
 
 
