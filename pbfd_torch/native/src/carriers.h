@@ -1,11 +1,12 @@
-// Obstacles in prescribed motion (contact/motion.py): where they are at the beginning and at the end of what each lane is to solve.
+// Obstacles in prescribed motion (contact/motion.py): where they are at the beginning and at the end of what each lane is to
+// solve.
 #pragma once
 #include "tree.h"
 
 namespace pbfd {
 
-// Where they are at all instants at which a step, or a part of one that is halved, may begin or end: rotation and position of each
-// obstacle, [instants, worlds, obstacles, 12], those of one world for all worlds that have the same.
+// Where they are at all instants at which a step, or a part of one that is halved, may begin or end: rotation and position of
+// each obstacle, [instants, worlds, obstacles, 12], those of one world for all worlds that have the same.
 template <class T> struct Timetable {
   const T* poses;
   int worlds, obstacles;
@@ -16,7 +17,7 @@ template <class V> struct Carriers {
   using T = typename Kind<V>::Scalar;
   int count;
   V *start, *end;  // [12 × count]
-  // How the solid carries over the step what stands at x: by `swung` (x − x₀) + `shift`, with x₀ where it is itself at the start.
+  // The solid carries over the step what stands at x by `swung` (x − x₀) + `shift`, with x₀ where it is itself at the start.
   V *swung, *shift;  // [9 × count], [3 × count]
 
   static int room(Sizes s) { return 36 * s.moving; }
@@ -52,7 +53,7 @@ template <class V> struct Carriers {
     for (int j = 0; j < 9; j++) out[j] += R[j];
   }
 
-  // How a solid sees a point at the end of the step; vectors turned from its frame into the world's, and back, in place if asked.
+  // How a solid sees a point at the end of the step; vectors turned from its frame into the world's and back, in place if asked.
   void to_own(int m, const V* x, V* out) const {
     const V* to = end + 12 * m;
     const V off[3] = {x[0] - to[9], x[1] - to[10], x[2] - to[11]};

@@ -140,7 +140,8 @@ template <class V, class N, int D> struct Slots {
   static bool there(const Plan<N, D>& plan) { return D == 3 && plan.bodies.rows > 0; }
   static char* bytes(Arena<V>& arena, int size) { return reinterpret_cast<char*>(arena.take(in(size))); }
   T* scalars(Arena<V>& arena) const {
-    return there(plan) ? reinterpret_cast<T*>(bytes(arena, int(sizeof(T)) * Finder<T>::room(bodies, plan.nodes + plan.moving))) : nullptr;
+    if (!there(plan)) return nullptr;
+    return reinterpret_cast<T*>(bytes(arena, int(sizeof(T)) * Finder<T>::room(bodies, plan.nodes + plan.moving)));
   }
 
   void find(int i, Poses<V> start, Poses<V> free, bool sorted) {
