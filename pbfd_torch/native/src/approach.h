@@ -117,7 +117,7 @@ template <class V> struct Approach {
   // That part of a step after which the gap is the largest: where a rim is seen along its axis, whole ones miss.
   [[gnu::noinline]] void climb(M open, const V* turn) {
     constexpr double PARTS[4] = {1.0, 0.5, 0.2, 0.05};
-    V best[3], most(0);
+    V best[3] = {V(0), V(0), V(0)}, most(0);
     for (int k = 0; k < 4; k++) {
       V n[3], y[3], height(0);
       ahead(turn, V(PARTS[k]), n);
