@@ -66,10 +66,6 @@ def test_engine(pbfd: Pbfd) -> None:
     defined = pbfd("simulate", "hopper", *short, "--engine", "torch").data
     assert (defined["engine"], defined["engine_reason"]) == ("torch", "")
     assert compiled["energy_end_J"] == pytest.approx(defined["energy_end_J"], rel=1e-6)
-    left = pbfd("simulate", "stack", *SHORT, "--json").data
-    assert left["engine"] == "torch"
-    assert "BodyContact" in left["engine_reason"]
-    assert "no compiled steps: the core does not know" in pbfd("simulate", "stack", "--engine", "native").words
     for other in (("--accuracy", "1e-3"), ("--schedule", "asynchronous")):
         assert f"must be torch with {other[0]}" in pbfd("simulate", "hopper", "--engine", "native", *other).words
 

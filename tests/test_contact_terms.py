@@ -19,6 +19,8 @@ from pbfd_torch.contact.obstacle import Obstacle
 from pbfd_torch.contact.pairing import friction_between
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.errors import ContactOverflowError, InputError
+from pbfd_torch.integrators.implicit_euler import ImplicitEuler
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
@@ -224,12 +226,13 @@ def test_one_term_of_each_kind() -> None:
 
 
 def test_fcl_is_needed_for_hulls_alone() -> None:
-    """Not imported for a chain on the ground, nor for boxes on boxes; a hull beside a box needs it."""
+    """Steps in PyTorch do not import it for a chain on the ground, nor for boxes on boxes; a hull beside a box needs it."""
     program = """
 import sys
 import torch
 from pbfd_torch.contact.shapes import Box, Collider
 from pbfd_torch.models import SCENES
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.terms.contact_terms import contact_terms
@@ -237,7 +240,7 @@ from pbfd_torch.terms.inertia import Inertia
 from tests.test_contact_terms import HULL, two_free
 
 def simulate(scene, q=None):
-    simulator = Simulator(scene, 0.01)
+    simulator = Simulator(scene, 0.01, engine=Torch())
     state = simulator.initial_state(q)
     for _ in range(2):
         state, solution = simulator.step(state)
@@ -322,8 +325,11 @@ def test_overflow_can_raise() -> None:
 
 
 def test_overflow_can_grow() -> None:
-    """One slot that doubles until all fit gives the run with enough slots, to the last bit."""
-    grown, enough = (three_steps(three_balls(**x), 0.4, 0.199) for x in ({"slots": 1, "overflow": Overflow.GROW}, {"slots": 4}))
+    """One slot that doubles until all fit gives the run with enough slots, where PyTorch makes both to the last bit."""
+    rules: tuple[dict[str, object], ...] = ({"slots": 1, "overflow": Overflow.GROW}, {"slots": 4})
+    grown, enough = (
+        three_steps(Simulator(three_balls(**x).scene, 0.01, ImplicitEuler(), engine=Torch()), 0.4, 0.199) for x in rules
+    )
     assert bool(grown.solved.all())
     assert not bool(grown.hazards.any())
     assert torch.equal(grown.q, enough.q)

@@ -77,7 +77,7 @@ class Bodies:
         obstacles = list(terms[0].obstacles) if terms else []
         eye = torch.eye(4, dtype=a.dtype)
         starts = [eye if x.motion.moves else x.start for x in obstacles]
-        if any(x.ndim > 2 for x in [frames[..., 0, :, :], *starts]):
+        if terms and any(x.ndim > 2 for x in [frames[..., 0, :, :], *starts]):
             raise unknown("contact between bodies whose frames differ from world to world")
         seats = [a.topology.njoint + carriers.number(x) if x.motion.moves else -1 for x in obstacles]
         moving = [*range(len(nodes)), *(len(nodes) + k for k, seat in enumerate(seats) if seat >= 0)]

@@ -67,13 +67,12 @@ template <class V, class N, int D> struct Contacts {
       for (int i = first; i < last; i++) {
         const Law<V>* law = laws.at(candidates.law[i]);
         if (!law || !law->throws()) continue;
-        V gap[3], c[D], &out = bounce[candidates.law[i]];
-        const Poses<V> at[] = {before, free, laws.coasting};
-        for (int k = 0; k < 3; k++) {
-          Beside<V, D> solid;
-          center(i, at[k], c), gap[k] = -depth(pair, i, at[k], c, solid);
-        }
-        out = select(anew, law->bounce(gap[0], gap[1], gap[2], step), out);
+        V gap[2], c[D], &out = bounce[candidates.law[i]];
+        Beside<V, D> solid;
+        const V start = -began(pair, i, c, solid);
+        const Poses<V> at[] = {free, laws.coasting};
+        for (int k = 0; k < 2; k++) center(i, at[k], c), gap[k] = -depth(pair, i, at[k], c, solid);
+        out = select(anew, law->bounce(start, gap[0], gap[1], step), out);
       }
     });
   }
