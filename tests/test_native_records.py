@@ -32,6 +32,7 @@ from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
+from pbfd_torch.terms.curved_body_contact import CurvedBodyContact
 from pbfd_torch.terms.curved_contact import CurvedContact
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_limits import JointLimits
@@ -135,8 +136,10 @@ def test_named_scenes(name: str, integrator: Integrator[Any]) -> None:
     """In a plane and in space; eased and halved steps among them."""
     setup = SCENES[name](worlds=11) if name in SCENES else file_setup(ROBOTS / name, worlds=11)
     simulator, state, controls = started(setup, 0.01, integrator, 25)
-    between = any(isinstance(term, BodyContact) for term in setup.scene.terms)
-    require_same(*recorded(simulator, state, controls, 25), ties=0.01 if between else 0.0)
+    # where a polytope stands for a curved body, edges and faces of it tie that the body does not have
+    ties = {CurvedBodyContact: 0.06, BodyContact: 0.02}
+    allowed = max((ties.get(type(term), 0.0) for term in setup.scene.terms), default=0.0)
+    require_same(*recorded(simulator, state, controls, 25), ties=allowed)
 
 
 def test_steps_that_are_eased_halved_or_not_solved() -> None:
