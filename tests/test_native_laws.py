@@ -21,7 +21,6 @@ from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
-from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.contact_laws import ContactLaws
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -270,15 +269,13 @@ def test_single_precision() -> None:
 
 @pytest.mark.parametrize("choice", Friction)
 def test_choices_of_the_command(choice: Friction) -> None:
-    """Scenes that are native with Coulomb's friction are so with any; anchors between bodies are not known."""
+    """Scenes that are native with Coulomb's friction are so with any."""
     for name in SCENES:
         setup = SCENES[name]()
         touches = any(isinstance(term, ContactLaws) for term in setup.scene.terms)
         if not touches or not native_of(setup.scene):
             continue
-        scene = with_friction(setup, choice, DT).scene
-        between = any(isinstance(term, BodyContact) for term in scene.terms)
-        assert native_of(scene) is not (choice is Friction.ANCHORED and between), name
+        assert native_of(with_friction(setup, choice, DT).scene), name
 
 
 def native_of(scene: Scene) -> bool:

@@ -137,7 +137,7 @@ def test_named_scenes(name: str, integrator: Integrator[Any]) -> None:
     setup = SCENES[name](worlds=11) if name in SCENES else file_setup(ROBOTS / name, worlds=11)
     simulator, state, controls = started(setup, 0.01, integrator, 25)
     # where a polytope stands for a curved body, edges and faces of it tie that the body does not have
-    ties = {CurvedBodyContact: 0.06, BodyContact: 0.02}
+    ties: dict[type, float] = {CurvedBodyContact: 0.06, BodyContact: 0.02}
     allowed = max((ties.get(type(term), 0.0) for term in setup.scene.terms), default=0.0)
     require_same(*recorded(simulator, state, controls, 25), ties=allowed)
 
