@@ -80,7 +80,7 @@ struct pbfd_roster {
   int links, slots, first_limit, own;
   const int *carrier, *slot, *danger;
   const void* real;
-  const int *meeting_slot, *meeting_danger;  // the first ones of each group of pairs of bodies
+  const int *meeting_slot = nullptr, *meeting_danger = nullptr;  // the first ones of each group of pairs of bodies
 };
 
 // The record of steps `first` … `last` − 1 of all steps of all worlds that have been made, where world w makes its steps w,
