@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -115,7 +116,7 @@ class Bodies:
         tables = (links, self.extents, [like.new_tensor(self.slack)], self.places, self.numbers, self.sizes)
         return torch.cat([*itertools.chain(*tables), self._hulls[1].to(like.dtype)])
 
-    @property
+    @cached_property
     def _hulls(self) -> tuple[list[int], Tensor]:
         return hulls(self.polytopes)
 

@@ -104,20 +104,6 @@ template <class T> struct Finder {
     return dropped;
   }
 
-  // How far a link's colliders may move without one being missed: half as far again as its free motion, and the slack.
-  T reach_of_free_motion(int group, int link) const {
-    T traveled(0);
-    if (const int k = bodies.node[link]; k >= 0) {
-      const T* frame = bodies.frame + 12 * link;
-      Pose<T> from, to;
-      placed(start[k], frame, from), placed(ahead[k], frame, to);
-      T chord(0);
-      for (int j = 0; j < 9; j++) chord = fma(to.rotation[j] - from.rotation[j], to.rotation[j] - from.rotation[j], chord);
-      traveled = fma(bodies.extent[group * bodies.links + link], sqrt(T(0.5) * chord), apart(to.position, from.position));
-    }
-    return fma(T(1.5), traveled, bodies.slack[group]);
-  }
-
   static constexpr double SHORT = 1e-3;  // of a cylinder's length: rims nearer to one another are one
 
   const Pose<T>& standing(int node) const { return node < 0 ? world : start[node]; }

@@ -214,6 +214,7 @@ template <class V, class N, class Scheme> struct Recorder {
       each_limit(plan, after.q, [&](int i, V past) { strained(max(past, V(-1)) / V(TOO_FAR), roster.first_limit + i); });
     for (int i = 0; i < count; i++) record->suspect[at + i] = record->hazards[at + i] ? int(lane(number, i)) : -1;
   }
+
   // Between bodies: every lane has its own, and in its own slots.
   template <class F> void show_meetings(F&& strained) {
     Meetings<V, N, D>& meetings = balance.meetings;

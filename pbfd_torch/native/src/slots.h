@@ -24,7 +24,7 @@ template <class V, class N, int D> struct Slots {
   Spot<V>* spot;        // [rows × SPOTS]
   int active, *rows;    // those with candidates in some lane
   int *most, *count;    // [rows] in any lane, [rows × W] in each
-  int *found, *listed;   // [W × groups], [W × listed] of each lane, row · SPOTS + place of each candidate, as they were found
+  int *found, *listed;   // [W × groups], [W × slots] of each lane, row · SPOTS + place of each candidate, as they were found
   V still[12];          // the world's own pose
 
   static int in(int bytes) { return (bytes + int(sizeof(V)) - 1) / int(sizeof(V)); }
@@ -55,11 +55,17 @@ template <class V, class N, int D> struct Slots {
   // A step of these lanes begins at these poses, and leads to `free` without contact. `sorted`: nearest first, as in the reference.
   void find(M which, Poses<V> start, Poses<V> free, V dt, bool sorted) {
     before = start;
+    for (int g = 0; g < bodies.groups; g++)
+      for (int l = 0; l < bodies.links; l++) {  // half as far again as its free motion, and the slack
+        V& far = reach[g * bodies.links + l];
+        far = select(which, fma(V(1.5), travel(g, l, start, free), V(bodies.slack[g])), far);
+      }
     for (int i = 0; i < W; i++)
       if (lane(which, i)) find(i, start, free, sorted);
     gather();
-    for (int k = 0; k < active; k++)
-      for (int j = 0; j < most[rows[k]]; j++) begin(rows[k], spot[SPOTS * rows[k] + j], dt);
+    each_row([&](auto pair, int r) {
+      for (int j = 0; j < most[r]; j++) begin(pair, r, spot[SPOTS * r + j], dt);
+    });
   }
 
   // A node that joints move, or −1.
@@ -86,18 +92,6 @@ template <class V, class N, int D> struct Slots {
   Curved<T> curved(int row) const { return {bodies.of_row + NUMBERS_OF_A_ROW * row}; }
   Standing<V> standing(Poses<V> at, int node) const { return {rotation(at, node), position(at, node)}; }
   const N* laws(int row) const { return plan.laws + LAWS_OF_A_ROW * row; }
-
-  // How deep a candidate is at a point as the solid's body sees it.
-  V depth(int row, const Spot<V>& s, const V* own) const {
-    Beside<V, 3> beside;
-    switch (bodies.meeting[row]) {
-      case BALL_ON_PILL: Guarded<Pill>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_BLOCK: Guarded<Block>::beside(s, solid(row), own, beside); break;
-      case BALL_ON_DRUM: Guarded<Drum>::beside(s, solid(row), own, beside); break;
-      default: Face::beside(s, solid(row), own, beside);
-    }
-    return V(radius(row)) - beside.distance;
-  }
 
   // Where a candidate of a group is in a lane.
   int* slot(int group, int i, int which) const {
@@ -153,10 +147,7 @@ template <class V, class N, int D> struct Slots {
       }
     bool more = false;
     for (int g = 0; g < bodies.groups; g++) {
-      for (int l = 0; l < bodies.links; l++) {
-        const int at = g * bodies.links + l;
-        put(reach[at], i, finder.reach[at] = finder.reach_of_free_motion(g, l));
-      }
+      for (int l = g * bodies.links; l < (g + 1) * bodies.links; l++) finder.reach[l] = lane(reach[l], i);
       more = finder.find(g, sorted || bodies.memory[g] >= 0) || more;
       found[W * g + i] = finder.count;
       for (int c = 0; c < finder.count; c++) {
@@ -224,27 +215,27 @@ template <class V, class N, int D> struct Slots {
   }
 
   // Where it is at the start, as the solid's body sees it.
-  void begin(int row, Spot<V>& s, V dt) {
+  template <class Pair> void begin(Pair, int row, Spot<V>& s, V dt) {
     V c[3], ran[3], own[3], belt[3];
+    Beside<V, 3> solid_there;
     center(row, s, before, c), seen(row, before, c, s.start);
     const int runs = bodies.first[row] >= plan.nodes ? bodies.first[row] : bodies.second[row];  // that of an obstacle
     for (int j = 0; j < 3; j++) own[j] = V(laws(row)[5 + j]);
     times(runs >= plan.nodes ? rotation(before, runs) : still, own, belt);
     transposed_times(rotation(before, bodies.second[row]), belt, ran);
-    s.began = bodies.meeting[row] < CURVED ? depth(row, s, s.start) : curved_depth(row, s, c);
+    Pair::Surface::beside(s, solid(row), s.start, solid_there);
+    s.began = V(radius(row)) - solid_there.distance;
+    if constexpr (Pair::Support::wanders) s.began = curved_depth<typename Pair::Support>(row, s, c, solid_there);
     for (int j = 0; j < 3; j++) s.start[j] = fma(dt, ran[j], s.start[j]);
   }
 
-  // Of a curved body, and which part of its normal force it gives in this step.
-  V curved_depth(int row, Spot<V>& s, const V* c) const {
+  // Of a curved body beside a plane, and which part of its normal force it gives in this step.
+  template <class Support> V curved_depth(int row, Spot<V>& s, const V* c, Beside<V, 3>& plane) const {
     const Standing<V> one = standing(before, bodies.first[row]), other = standing(before, bodies.second[row]);
-    Beside<V, 3> plane;
     V axis[3];
-    Face::beside(s, solid(row), s.start, plane);
     times(other.rotation, s.normal, plane.normal), times(one.rotation, curved(row).axis(), axis);
     s.share = Ellipsoid::share(s.lying, dot(axis, plane.normal));
-    return bodies.meeting[row] == ROUND_ON_ROUND ? sunk<Approaching>(s, curved(row), one, other, c, plane)
-                                                 : sunk<Ellipsoid>(s, curved(row), one, other, c, plane);
+    return sunk<Support>(s, curved(row), one, other, c, plane);
   }
 };
 
