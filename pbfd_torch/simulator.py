@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Generic, Self
 
 from torch import Tensor
@@ -18,7 +17,7 @@ from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.gradients.parts import Carriers
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
 from pbfd_torch.integrators.integrator import Integrator, S
-from pbfd_torch.native.engine import Engine, Torch, chosen
+from pbfd_torch.native.engine import Engine, chosen
 from pbfd_torch.native.rollout import rolled_out as many_rolled_out
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
@@ -26,6 +25,7 @@ from pbfd_torch.scene import Scene
 from pbfd_torch.schedules.adaptive import AdaptiveStepper
 from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.stepping.accuracy import Accuracy
 from pbfd_torch.stepping.eager import MOST_EVALUATIONS, EagerStepper
 from pbfd_torch.stepping.stepper import Solver, Stepper
 from pbfd_torch.tree.articulation import Articulation
@@ -215,24 +215,12 @@ class Simulator(Generic[S]):
         return self.roller(self.stepper, state, controls, steps, progress)
 
 
-@dataclass(frozen=True)
-class _Adaptive(Torch):
-    """Steps in PyTorch that each world chooses the length of."""
-
-    accuracy: float
-    shortest: float | None
-
-    def stepper(self, eager: EagerStepper[Any]) -> AdaptiveStepper[Any]:
-        """See `Engine`."""
-        return AdaptiveStepper(eager, self.accuracy, self.shortest)
-
-
 class AdaptiveSimulator(Simulator[S]):
     """A `Simulator` whose steps, the frames, are made of as many shorter ones as each world needs (`AdaptiveStepper`).
 
     `dt`: length of a frame, and of the longest step [s]. `accuracy`: what a step's end may be off by, as estimated [m] > 0:
-    the root mean square over the mass of a link, the largest of all links. `shortest`: a step that is never refused [s]; None:
-    dt/4096."""
+    the root mean square over the mass of a body, the largest of all bodies. `shortest`: a step that is never refused [s]; None:
+    dt/4096. `engine`: as in `Simulator`."""
 
     def __init__(
         self,
@@ -242,13 +230,18 @@ class AdaptiveSimulator(Simulator[S]):
         integrator: Integrator[S] | None = None,
         solver: Solver | None = None,
         shortest: float | None = None,
+        engine: Engine | None = None,
     ) -> None:
-        super().__init__(scene, dt, integrator, solver, halvings=0, engine=_Adaptive(accuracy, shortest))
+        self._accuracy = Accuracy.within(dt, accuracy, shortest)
+        super().__init__(scene, dt, integrator, solver, halvings=0, engine=engine)
 
-    @property
-    def engine_reason(self) -> str:
-        """See `Simulator`."""
-        return "steps that each world chooses the length of are made in PyTorch"
+    def _stepping(self) -> tuple[Stepper[S], str, str]:
+        if self._made is None:
+            fixed, *known = super()._stepping()
+            # where obstacles are is asked for at each step's own times
+            whole = isinstance(fixed, NativeStepper) and not fixed.moving
+            self._made = (fixed.framed(self._accuracy) if whole else AdaptiveStepper(fixed, self._accuracy), *known)
+        return self._made
 
     def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but

@@ -66,13 +66,12 @@ class Fitted:
 
 
 def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
-    """The terms, with those that can be `Fitted` to the stiffness z = Δt² (∂r/∂q)/m that all of them have together: m is what the
-    other joints, free to move, let each joint feel of its inertia in the rest configuration."""
+    """The terms, with those that can be `Fitted` to the stiffness z = Δt² (∂r/∂q)/m that all of them have together, m as in
+    `felt_inertia`."""
     able = [term for term in terms if isinstance(term, Fittable)]
     if not able:
         return terms
-    inertia = mass_matrix(articulation, articulation.rest, terms)
-    felt = 1 / torch.linalg.inv_ex(inertia).inverse.diagonal(dim1=-2, dim2=-1)
+    felt = felt_inertia(articulation, terms)
     slope = sum((term.slope(articulation, dt) for term in able), torch.zeros_like(felt))
     share = fit((dt * dt)[..., None] * slope / felt)
     turning = torch.zeros_like(articulation.topology.turns).index_fill(0, articulation.topology.turning_v.flatten(), True)
@@ -80,8 +79,15 @@ def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Seq
     return [Fitted(term.taken_at(share), share) if isinstance(term, Fittable) else term for term in terms]
 
 
+def felt_inertia(articulation: Articulation, terms: Sequence[Term]) -> Tensor:
+    """What the other joints, free to move, let each coordinate feel of its inertia in the rest configuration, `[*, nv]`."""
+    inertia = mass_matrix(articulation, articulation.rest, terms)
+    return 1 / torch.linalg.inv_ex(inertia).inverse.diagonal(dim1=-2, dim2=-1)
+
+
 def fit(stiffness: Tensor) -> Tensor:
     """θ(z) = 1/(1 − e^{−z}) − 1/z, from ½ at z = 0 to 1: with it a damped joint slows down by exactly e^{−z} in a step."""
-    small = stiffness < 1e-3
-    z = torch.where(small, torch.ones_like(stiffness), stiffness)
-    return torch.where(small, 0.5 + stiffness / 12, -1 / torch.expm1(-z) - 1 / z)
+    whole = stiffness.double()  # in float32 the difference would lose four digits
+    small = whole < 1e-3
+    z = torch.where(small, torch.ones_like(whole), whole)
+    return torch.where(small, 0.5 + whole / 12, -1 / torch.expm1(-z) - 1 / z).to(stiffness.dtype)

@@ -23,7 +23,7 @@ class _Plan(ctypes.Structure):
         *(
             (name, ctypes.c_int)
             for name in (
-                *("bytes", "dimension", "nodes", "nq", "nv", "nu", "halvings"),
+                *("bytes", "dimension", "nodes", "nq", "nv", "nu"),
                 *("candidates", "anchors", "planes", "solids", "samples", "forms", "uncommon", "pushes", "varied"),
             )
         ),

@@ -67,6 +67,6 @@ def passed(time: Tensor, step: Tensor, count: int) -> Tensor:
 
 def parted(time: Tensor, step: Tensor, parts: int) -> Tensor:
     """The times at the ends of so many parts of all steps between times `[count + 1, *batch]`, `[parts · count + 1, *batch]`."""
-    within = step / parts * torch.arange(parts, dtype=time.dtype)
-    begun = time[:-1, None] + within.reshape(-1, *(1 for _ in time.shape[1:]))
+    within = step / parts * torch.arange(parts, dtype=time.dtype).reshape(-1, *(1 for _ in time.shape[1:]))
+    begun = time[:-1, None] + within
     return torch.cat((begun.flatten(0, 1), time[-1:]))

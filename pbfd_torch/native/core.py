@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import math
 from dataclasses import dataclass
@@ -16,7 +17,9 @@ from pbfd_torch.native.carriers import parted, passed
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.native.schemes import ON_POSITIONS, Scheme
+from pbfd_torch.native.ways import Ways
 from pbfd_torch.solvers.objective import FALLBACKS, Solution
+from pbfd_torch.stepping.accuracy import Accuracy
 
 COUNTED = ("status", "evaluations", "iterations", "hazards")
 WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another thread has begun
@@ -24,7 +27,9 @@ WORTH_A_BLOCK = 128  # steps of worlds: fewer are done about as soon as another 
 
 class _Steps(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_double) for name in ("dt", "tolerance", "surplus", "share", "jump")),
+        ("dt", ctypes.c_void_p),
+        *((name, ctypes.c_int) for name in ("alike", "halvings")),
+        *((name, ctypes.c_double) for name in ("tolerance", "surplus", "share", "jump")),
         *((name, ctypes.c_int) for name in ("evaluations", "worlds", "first", "last", "steps", "held")),
         ("given", ctypes.c_void_p * 10),
         ("control", ctypes.c_void_p),
@@ -36,15 +41,21 @@ class _Steps(ctypes.Structure):
         ("trial", ctypes.c_void_p * 7),
         ("poses", ctypes.c_void_p),
         ("timed", ctypes.c_int),
+        *((name, ctypes.c_void_p) for name in ("halved", "eased", "ends")),
+        *((name, ctypes.c_double) for name in ("accuracy", "shortest")),
+        *((name, ctypes.c_void_p) for name in ("wish", "pace", "spacing", "made")),
+        ("before_last", ctypes.c_void_p * 10),
     )
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What is asked of steps. dt [s]; tolerance of ‖r/scale‖; surplus: see `EnergyMomentum`; share: see `Variational`, 1 for
-    implicit Euler; jump: see `Bdf2`; evaluations: at most, of each with all that is tried."""
+    """What is asked of steps. dt [s], `[]`, or `[*batch]` of each world; halvings: how often they may be halved; tolerance of
+    ‖r/scale‖; surplus: see `EnergyMomentum`; share: see `Variational`, 1 for implicit Euler; jump: see `Bdf2`; evaluations: at
+    most, of each with all that is tried."""
 
-    dt: float
+    dt: Tensor
+    halvings: int
     tolerance: float
     surplus: float
     share: float
@@ -61,6 +72,8 @@ class Journey:
         poses: of the obstacles that move, at the ends of all parts of all steps, see `Carriers.poses`.
         found: what it has after each step, `[*steps, *batch, ...]`; steps: how many, or nothing for a single one.
         residual_norm, counted, fallbacks: how each was solved, `[*steps, *batch, ...]`.
+        ways: how it was made, of a single step, where that is asked for.
+        frames: what there is beside, where steps are `Frames`.
     """
 
     def __init__(
@@ -71,7 +84,10 @@ class Journey:
         steps: tuple[int, ...],
         own: Tensor,
         poses: Tensor,
+        ways: Ways | None = None,
+        frames: Frames | None = None,
     ) -> None:
+        self.ways, self.frames = ways, frames
         self.given, self.found, self.poses = given, found, poses
         batch = tuple(given["q"].shape[:-1])
         self._steps, self._worlds = math.prod(steps), math.prod(batch)
@@ -85,8 +101,11 @@ class Journey:
 
     def call(self, terms: Terms) -> _Steps:
         """What the core is to be asked."""
-        asked = _Steps(terms.dt, terms.tolerance, terms.surplus, terms.share, terms.jump, terms.evaluations, self._worlds)
-        asked.last, asked.steps = self._worlds, self._steps
+        alike = terms.dt.ndim == 0
+        self._dt = terms.dt if alike else whole(terms.dt, tuple(self.given["q"].shape[:-1]))
+        asked = _Steps(self._dt.data_ptr(), alike, terms.halvings)
+        asked.tolerance, asked.surplus, asked.share, asked.jump = terms.tolerance, terms.surplus, terms.share, terms.jump
+        asked.evaluations, asked.worlds, asked.last, asked.steps = terms.evaluations, self._worlds, self._worlds, self._steps
         asked.held, asked.control = len(self.control) == 1, self.control.data_ptr()
         asked.given[: len(self.given)] = [x.data_ptr() for x in self.given.values()]
         asked.found[: len(self.found)] = [x.data_ptr() for x in self.found.values()]
@@ -94,6 +113,15 @@ class Journey:
         asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
         asked.own = self.own.data_ptr()
         asked.poses, asked.timed = self.poses.data_ptr(), self.poses.shape[1]
+        if self.ways is not None:
+            asked.halved, asked.eased, asked.ends = (x.data_ptr() for x in (self.ways.halved, self.ways.eased, self.ways.ends))
+        if self.frames is not None:
+            frames = self.frames
+            asked.accuracy, asked.shortest = frames.accuracy.length, frames.accuracy.shortest
+            asked.wish, asked.pace, asked.spacing, asked.made = (
+                x.data_ptr() for x in (frames.wish, frames.pace, frames.spacing, frames.made)
+            )
+            asked.before_last[: len(frames.before_last)] = [x.data_ptr() for x in frames.before_last.values()]
         return asked
 
     @property
@@ -101,7 +129,29 @@ class Journey:
         """How the steps were solved, `[*steps, *batch, ...]`."""
         counted = {name: x for name, x in self.counted.items() if name != "hazards"}
         lanes = int(counted["evaluations"].sum())
-        return Solution(self.found["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, **counted)
+        steps = None if self.frames is None else self.frames.made
+        return Solution(
+            self.found["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, steps=steps, **counted
+        )
+
+
+class Frames:
+    """Room for what frames leave beside states: how long each world's next step had better be [s], the length of the last one, how
+    many it has made, and the state before that, `[*steps, *batch, ...]`. wish: how long the first one had better be, `[*batch]`."""
+
+    def __init__(self, accuracy: Accuracy, wish: Tensor, found: dict[str, Tensor]) -> None:
+        self.accuracy, self.wish = accuracy, wish.contiguous()
+        batch = found["q"].shape[:-1]
+        self.pace, self.spacing = wish.new_empty(batch), wish.new_empty(batch)
+        self.made = torch.empty(batch, dtype=torch.int32)
+        self.before_last = {name: torch.empty_like(x) for name, x in found.items()}
+
+    def cut(self, count: int) -> Frames:
+        """The first of them."""
+        other = copy.copy(self)
+        other.pace, other.spacing, other.made = self.pace[:count], self.spacing[:count], self.made[:count]
+        other.before_last = {name: x[:count] for name, x in self.before_last.items()}
+        return other
 
 
 class Core:
@@ -112,12 +162,16 @@ class Core:
         self.plan, self._scheme, self._terms = plan, scheme, terms
         self._calls = Calls(library, plan, threads)
 
-    def go(self, state: State, control: Tensor, steps: tuple[int, ...]) -> Journey:
-        """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps. On several
-        threads where that is worth it: worlds do not know of each other, and it makes no difference to any."""
+    def go(self, state: State, control: Tensor, steps: tuple[int, ...], accuracy: Accuracy | None = None) -> Journey:
+        """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps; frames of this
+        accuracy, if any. On several threads where that is worth it: worlds do not know of each other, and it makes no difference to
+        any."""
         given = self._scheme.fields(state, self.plan)
         found = {name: _room_for(x, steps) for name, x in given.items()}
-        journey = Journey(given, found, control, steps, self.plan.own, self._poses(state.time, math.prod(steps)))
+        ways = None if steps or accuracy else Ways(found["q"], self._terms.halvings)
+        frames = None if accuracy is None else Frames(accuracy, self._wish(state), found)
+        poses = self._poses(state.time, math.prod(steps))
+        journey = Journey(given, found, control, steps, self.plan.own, poses, ways, frames)
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
@@ -143,8 +197,12 @@ class Core:
         """Where the obstacles that move are at the ends of all parts of so many steps from a time `[*batch]` on."""
         if not self.plan.carriers:
             return time.new_empty(0, 1, 0, 12)
-        step = time.new_tensor(self._terms.dt)
-        return self.plan.carriers.poses(parted(passed(time, step, steps), step, 2**self.plan.halvings))
+        step = self._terms.dt
+        return self.plan.carriers.poses(parted(passed(time, step, steps), step, 2**self._terms.halvings))
+
+    def _wish(self, state: State) -> Tensor:
+        """How long the first step of a frame had better be."""
+        return self._terms.dt.expand(state.time.shape) if state.pace is None else state.pace
 
     def balance(self, state: Velocities, control: Tensor | None, q: Tensor) -> tuple[Tensor, Tensor]:
         """The balance of forces of the energy–momentum step from a state at q `[*batch, nq]`: r `[*batch, nv]` and

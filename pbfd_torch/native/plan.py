@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.bdf2 import Bdf2
-from pbfd_torch.integrators.energy_momentum import EnergyMomentum
-from pbfd_torch.integrators.fitted import Fitted
+from pbfd_torch.integrators.fitted import felt_inertia
 from pbfd_torch.native.aligned import aligned
 from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.four_poses import Seats
@@ -22,7 +21,6 @@ from pbfd_torch.native.plan_contact import Candidates, joined, on_nodes
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
-from pbfd_torch.stepping.stepper import SHORTEST_STEP
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.body_contact import BodyContact
@@ -43,7 +41,7 @@ TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointL
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """sizes: nodes, nq, nv, nu, halvings, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
+    """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
     μ: the core knows these in space only, and not with BDF2. carriers: of the obstacles that move. order: where the candidates are
@@ -68,11 +66,6 @@ class Plan:
     def take(self, worlds: Worlds) -> Plan:
         """The plan of some worlds, to the bit."""
         return replaced(self, own=worlds.pick(self.own, 1), seats=self.seats.take(worlds), carriers=self.carriers.take(worlds))
-
-    @property
-    def halvings(self) -> int:
-        """How often a step may be halved."""
-        return self.sizes[4]
 
 
 def planned(stepper: EagerStepper[Any]) -> Plan:
@@ -101,7 +94,7 @@ class _Parts:
 
     Attributes:
         a: as `aligned` gives it. nodes: see `_nodes`. driven: coordinates and dofs of the actuators. pushed: nodes.
-        halvings: for how many there are shares. joints, scene, pushes: numbers, as src/plan.h has them.
+        joints, scene, pushes: numbers, as src/plan.h has them.
     """
 
     a: Articulation
@@ -112,7 +105,6 @@ class _Parts:
     carriers: Carriers
     driven: list[int]
     pushed: list[int]
-    halvings: int
     joints: Sequence[Tensor]
     scene: Sequence[Tensor]
     pushes: Sequence[Tensor]
@@ -147,7 +139,7 @@ class _Parts:
         whole += candidates.carried if len(self.carriers) else []
         real, which, own = _told_apart(self.real)
         return Plan(
-            sizes=(t.njoint, t.nq, t.nv, len(self.driven) // 2, self.halvings, *candidates.sizes, len(self.pushed)),
+            sizes=(t.njoint, t.nq, t.nv, len(self.driven) // 2, *candidates.sizes, len(self.pushed)),
             whole=torch.tensor(whole, dtype=torch.int32),
             real=real,
             which=which,
@@ -168,8 +160,8 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
     """Those of a stepper's scene, in space. Raises `NotCompiledError`."""
     a = aligned(stepper.articulation)
     t, known = a.topology, _Terms(stepper, a)
-    shares = _shares(stepper, known.share)
-    joints = [_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), *shares]
+    felt = felt_inertia(stepper.articulation, stepper.scene.terms)
+    joints = [_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), felt]
     joints += [known.spring, known.damping, known.armature, known.dry, a.lower, a.upper, known.limit, known.rest]
     driven: list[int] = []
     if (act := known.actuators) is not None:
@@ -185,11 +177,10 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         carriers=known.carriers,
         driven=driven,
         pushed=known.pushed,
-        halvings=len(shares) - 1,
         joints=joints,
         scene=[reach(a)[..., None], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
         pushes=[x[k].flatten(-2) for k in range(2) for x in known.pushes],
-        memory=_memory(stepper.terms, known.candidates.anchors, bodies),
+        memory=_memory(stepper.scene.terms, known.candidates.anchors, bodies),
     )
 
 
@@ -228,25 +219,11 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
     a = stepper.articulation
     if a.device.type != "cpu":
         raise unknown(f"device {a.device.type}")
-    if stepper.step_size.ndim:
-        raise unknown("a step of its own for each world")
     if not isinstance(stepper.evaluations, int):
         raise unknown("evaluations of its own for each world")
     free = [j for j, size in enumerate(a.topology.joint_sizes) if size == (7, 6)]
     if not bool((a.joint_frame[..., free, :, :] == torch.eye(4, dtype=a.dtype)).all()):
         raise unknown("a free joint that does not move along the world's axes")
-
-
-def _shares(stepper: EagerStepper[Any], share: Tensor) -> list[Tensor]:
-    """θ of the smooth loads on joints in the whole step, where it is `share`, and in steps ½, ¼, … as long: as many as its halvings
-    may make."""
-    shares = [share]
-    for times in range(1, stepper.halvings + 1):
-        if stepper.dt / 2**times < SHORTEST_STEP:
-            break
-        terms = stepper.integrator.adapted(stepper.articulation, stepper.scene.terms, stepper.step_size / 2**times)
-        shares.append(next((term.share for term in terms if isinstance(term, Fitted)), share))
-    return shares
 
 
 def _plain(frames: Tensor) -> list[int]:
@@ -291,7 +268,6 @@ class _Terms:
 
     def __init__(self, stepper: EagerStepper[Any], a: Articulation) -> None:
         zero = torch.zeros(a.nv, dtype=a.dtype)
-        self.share = zero + (0.5 if isinstance(stepper.integrator, EnergyMomentum) else 1.0)
         self.spring = self.damping = self.armature = self.dry = self.limit = zero
         self.rest = a.rest
         self.limit_release, self.limit_per_force, self.dry_speed = 1.0, 0.0, 1e-3
@@ -303,17 +279,14 @@ class _Terms:
         self.candidates = Candidates(self.carriers)
         self.meetings: list[BodyContact] = []
         seen: set[type] = set()
-        for term in stepper.terms:
-            inner: Any = term
-            if isinstance(term, Fitted):
-                self.share, inner = term.share, term.term
-            kind = type(inner)
+        for term in stepper.scene.terms:  # the core fits them itself
+            kind = type(term)
             if kind not in TERMS:
                 raise unknown(kind.__name__)
             if kind in seen and kind not in (*CONTACTS, Pushes):
                 raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
-            self._take(a, inner)
+            self._take(a, term)
         self._require_own_drives()
 
     def _take(self, a: Articulation, term: Any) -> None:
@@ -321,7 +294,7 @@ class _Terms:
             case JointSprings():
                 self.spring, self.rest = term.stiffness, term.rest
             case JointDamping():
-                self.damping = term.damping / self.share  # `taken_at` has multiplied it
+                self.damping = term.damping
             case Armature():
                 self.armature = term.inertia
             case JointDryFriction():

@@ -11,14 +11,16 @@ from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.calls import Calls, whole
+from pbfd_torch.native.core import Frames
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan, planned_in_space
 from pbfd_torch.native.roster import CONTACT, rostered
 from pbfd_torch.native.schemes import SCHEMES
+from pbfd_torch.native.stretch import Stretch
 from pbfd_torch.records.recording import assembled
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
-from pbfd_torch.solvers.objective import FALLBACKS, Solution
+from pbfd_torch.solvers.objective import FALLBACKS
 from pbfd_torch.stepping.eager import EagerStepper
 
 WORTH_A_BLOCK = 1024  # steps of worlds: fewer are recorded about as soon as another thread has begun
@@ -35,7 +37,9 @@ class _Roster(ctypes.Structure):
 
 class _Record(ctypes.Structure):
     _fields_ = (
-        ("dt", ctypes.c_double),
+        ("dt", ctypes.c_void_p),
+        ("alike", ctypes.c_int),
+        ("spacing", ctypes.c_void_p),
         *((name, ctypes.c_int) for name in ("worlds", "first", "last")),
         ("given", ctypes.c_void_p * 10),
         ("found", ctypes.c_void_p * 10),
@@ -48,19 +52,22 @@ class Writer(Generic[S]):
     """Writes what a record has of the steps of a stepper. `plan`: the steps'; `threads`: at most."""
 
     def __init__(self, library: Library, eager: EagerStepper[S], plan: Plan, threads: int) -> None:
-        self.scene, self.dt = eager.scene, eager.dt
+        self.scene, self.dt, self._size = eager.scene, eager.dt, eager.step_size.detach()
         space = plan if plan.dimension == 3 else planned_in_space(eager)
         self.roster = rostered(eager, space)
         self._scheme, self._plan = SCHEMES[type(eager.integrator)], plan
         self._calls, self._own = Calls(library, space, threads), space.own
 
-    def write(self, before: S, states: S, arrays: dict[str, Tensor]) -> None:
-        """Of steps from the state before the first to those after each `[*steps, *batch, …]`, in arrays of this length: the state
-        after each, and its contacts if there is a `suspect`; `hazards` are there already."""
+    def write(self, before: S, states: S, arrays: dict[str, Tensor], frames: Frames | None = None) -> None:
+        """Of steps or frames from the state before the first to those after each `[*steps, *batch, …]`, in arrays of this length:
+        the state after each, and its contacts if there is a `suspect`; `hazards` are there already."""
         given, found = (self._scheme.fields(x, self._plan) for x in (before, states))
+        given = given if frames is None else frames.before_last
         batch = tuple(before.q.shape[:-1])
         worlds, steps = math.prod(batch), math.prod(states.q.shape[:-1])
-        asked = _Record(self.dt, worlds, 0, steps)
+        alike = self._size.ndim == 0
+        dt = self._size if alike else whole(self._size, batch)
+        asked = _Record(dt.data_ptr(), alike, None if frames is None else frames.spacing.data_ptr(), worlds, 0, steps)
         for i, (start, end) in enumerate(zip(given.values(), found.values(), strict=True)):
             asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
         for name, array in arrays.items():
@@ -89,7 +96,8 @@ class Record(Generic[S]):
         count = torch.empty(0, dtype=torch.int32)
         self._states = {name: like.new_empty(room + 1, *batch, *event) for name, event in _state_events(writer.scene).items()}
         self._contacts = {name: like.new_empty(room, *batch, roster.slots, *event) for name, event in CONTACT.items()}
-        self._counts = {name: count.new_empty(room, *batch) for name in ("suspect", "hazards")}
+        self._seen = {name: count.new_empty(room, *batch) for name in ("suspect", "hazards")}
+        self._substeps = count.new_ones(room, *batch)
         events: dict[str, tuple[int, ...]] = dict.fromkeys(_SOLUTION, ()) | {"fallbacks": (len(FALLBACKS),)}
         self._solution = {
             name: (like if name == "residual_norm" else count).new_empty(room, *batch, *event) for name, event in events.items()
@@ -102,23 +110,25 @@ class Record(Generic[S]):
                 self._contacts[name][..., slots] = values
         writer.write(state, state, {name: x[:1] for name, x in self._states.items()})
 
-    def add(self, before: S, states: S, solution: Solution) -> None:
-        """Steps from the state before the first to those after each, `[steps, *batch, …]`. An interruption before the end leaves
-        the record as it was."""
-        first, last = self.steps, self.steps + len(solution.status)
-        self._counts["hazards"][first:last] = states.hazards
+    def add(self, stretch: Stretch[S]) -> None:
+        """Further steps. An interruption before the end leaves the record as it was."""
+        before, states, solution = stretch.before, stretch.states, stretch.solution
+        first, last = self.steps, self.steps + len(stretch)
+        if solution.steps is not None:
+            self._substeps[first:last] = solution.steps
+        self._seen["hazards"][first:last] = states.hazards
         for name in _SOLUTION:
             self._solution[name][first:last] = getattr(solution, name)
         arrays = {name: x[first + 1 : last + 1] for name, x in self._states.items()}
-        arrays |= {name: x[first:last] for name, x in (self._contacts | self._counts).items()}
-        self._writer.write(before, states, arrays)
+        arrays |= {name: x[first:last] for name, x in (self._contacts | self._seen).items()}
+        self._writer.write(before, states, arrays, stretch.frames)
         self.steps, self._lanes = last, self._lanes + solution.lanes
 
     def finish(self) -> Rollout:
         """The record so far."""
         arrays = {name: x[: self.steps + 1] for name, x in self._states.items()}
-        arrays |= {name: x[: self.steps] for name, x in (self._contacts | self._counts | self._solution).items()}
-        arrays["substeps"] = torch.ones_like(arrays["status"])
+        arrays |= {name: x[: self.steps] for name, x in (self._contacts | self._seen | self._solution).items()}
+        arrays["substeps"] = self._substeps[: self.steps]
         return assembled(self._writer.scene, self._writer.dt, self._lanes, arrays)
 
 

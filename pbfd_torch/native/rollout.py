@@ -9,7 +9,6 @@ from torch import Tensor
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.stepper import NativeStepper, spread
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.solvers.per_world import mapped
 
 AT_ONCE = 4096  # steps of worlds: what is recorded in one go is in the processor's cache, and an interruption need not wait
 
@@ -32,12 +31,12 @@ def rolled_out(
             first = record.steps
             part = min(most, count - first)
             held = None if controls is None else spread(controls[first : first + part], batch)
-            states, solution = stepper.run(state, held, part)
+            stretch = stepper.run(state, held, part)
             told = _told(progress, first, part)
-            record.add(state, *(mapped(lambda x, kept=told: x[:kept], whole) for whole in (states, solution)))
+            record.add(stretch.cut(told))
             if told < part:
                 break
-            state = mapped(_last, states)
+            state = stretch.end
     except KeyboardInterrupt:
         if record.steps == 0:
             raise
@@ -54,7 +53,3 @@ def _told(progress: Callable[[int], object] | None, first: int, part: int) -> in
         except KeyboardInterrupt:
             return k + 1
     return part
-
-
-def _last(ends: Tensor) -> Tensor:
-    return ends[-1]

@@ -24,21 +24,30 @@ from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plan import Plan, planned
 from pbfd_torch.native.recording import Record, Writer
 from pbfd_torch.native.schemes import SCHEMES, Scheme
+from pbfd_torch.native.stretch import Stretch
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.stepping.accuracy import Accuracy
 from pbfd_torch.stepping.eager import EagerStepper
-from pbfd_torch.stepping.stepper import Solver
+from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
 class NativeStepper(Generic[S]):
     """A `Stepper` whose steps the compiled core makes, fallbacks and all, of what an `EagerStepper` is made of. `threads`: at most,
-    for batches that are worth it; None: as many as PyTorch uses. `plan`: of these steps, where it is known (`plan_of`). Raises
-    `InputError` where there is no core, and for a scene that it does not know, naming what it lacks (`uncovered`)."""
+    for batches that are worth it; None: as many as PyTorch uses. `plan`: of these steps, where it is known (`plan_of`). `accuracy`:
+    the steps are frames, each of as many shorter ones as a world needs (`AdaptiveStepper`); nothing may move then but the bodies.
+    Raises `InputError` where there is no core, and for a scene that it does not know, naming what it lacks (`uncovered`)."""
 
-    def __init__(self, eager: EagerStepper[S], threads: int | None = None, plan: Plan | None = None) -> None:
+    def __init__(
+        self,
+        eager: EagerStepper[S],
+        threads: int | None = None,
+        plan: Plan | None = None,
+        accuracy: Accuracy | None = None,
+    ) -> None:
         try:
             plan = plan or plan_of(eager)
         except NotCompiledError as missing:
@@ -47,19 +56,23 @@ class NativeStepper(Generic[S]):
         assert compiled is not None
         assert isinstance(eager.evaluations, int)
         self.eager = eager
+        self._accuracy = accuracy
         self.threads = threads or torch.get_num_threads()
         scheme: object = eager.integrator
         surplus = scheme.surplus if isinstance(scheme, EnergyMomentum) else math.inf
         tolerance = Fallbacks().direct.tolerance_for(eager.articulation.dtype)
         share = scheme.share if isinstance(scheme, Variational) else 1.0
         jump = scheme.jump if isinstance(scheme, Bdf2) else math.inf
-        terms = Terms(eager.dt, tolerance, surplus, share, jump, eager.evaluations)
+        halvings = eager.halvings
+        while halvings and eager.dt / 2**halvings < SHORTEST_STEP:
+            halvings -= 1
+        terms = Terms(eager.step_size.detach(), halvings, tolerance, surplus, share, jump, eager.evaluations)
         self._scheme: Scheme = SCHEMES[type(scheme)]
         self._core = Core(compiled, plan, self._scheme, terms, self.threads)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Another process loads the core itself."""
-        return NativeStepper, (self.eager, self.threads, self._core.plan)
+        return NativeStepper, (self.eager, self.threads, self._core.plan, self._accuracy)
 
     @property
     def scene(self) -> Scene:
@@ -102,20 +115,22 @@ class NativeStepper(Generic[S]):
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. The way has no balance: records ask for it."""
         journey = self._went(state, None if control is None else control[None], ())
-        solution = journey.solution
-        return self._after(state, journey, state.time + self.step_size), solution, Way(solution.q)
+        solution, ways = journey.solution, journey.ways
+        way = Way(solution.q) if ways is None else ways.way(self.integrator, solution.q)
+        return self._after(state, journey, state.time + self.step_size), solution, way
 
-    def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
-        """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero): the states
-        after each, `[steps, *batch, ...]`, and how each was solved."""
+    def run(self, state: S, controls: Tensor | None, steps: int) -> Stretch[S]:
+        """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero)."""
+        state = self.complete(state)
         journey = self._went(state, controls, (steps,))
-        return self._after(state, journey, passed(state.time, self.step_size, steps)[1:]), journey.solution
+        states = self._after(state, journey, passed(state.time, self.step_size, steps)[1:])
+        return Stretch(state, states, journey.solution, journey.frames)
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
         """The states after steps, and how these were solved."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps)
+        return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps, self._accuracy)
 
     def _after(self, state: S, journey: Journey, time: Tensor) -> S:
         """The states after steps from a state, at these times."""
@@ -126,7 +141,8 @@ class NativeStepper(Generic[S]):
             memory = tuple(whole[..., first : first + n * width].unflatten(-1, (n, width)) for first, n, width in plan.memory)
         elif time.ndim > state.time.ndim:  # there is nothing in it
             memory = tuple(x.expand(len(time), *x.shape) for x in memory)
-        return replaced(state, **found | {"time": time, "hazards": journey.counted["hazards"], "memory": memory})
+        pace = None if journey.frames is None else journey.frames.pace
+        return replaced(state, **found | {"time": time, "hazards": journey.counted["hazards"], "memory": memory, "pace": pace})
 
     def complete(self, state: S) -> S:
         """With zero for an acceleration that is not known, and anchors where there is nothing in the memory yet."""
@@ -147,17 +163,26 @@ class NativeStepper(Generic[S]):
         assert compiled is not None
         return Writer(compiled, self.eager, self._core.plan, self.threads)
 
+    @property
+    def moving(self) -> bool:
+        """Whether obstacles move."""
+        return len(self._core.plan.carriers) > 0
+
+    def framed(self, accuracy: Accuracy) -> NativeStepper[S]:
+        """The same whose steps are frames."""
+        return NativeStepper(self.eager, self.threads, self._core.plan, accuracy)
+
     def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
         """See `Stepper`."""
         return self.eager.objective(state, control)
 
     def take(self, worlds: Worlds) -> NativeStepper[S]:
         """See `Stepper`: to the bit what they do among all."""
-        return NativeStepper(self.eager.take(worlds), self.threads, self._core.plan.take(worlds))
+        return NativeStepper(self.eager.take(worlds), self.threads, self._core.plan.take(worlds), self._accuracy)
 
     def sized(self, step_size: Tensor) -> NativeStepper[S]:
         """See `Stepper`."""
-        return NativeStepper(self.eager.sized(step_size), self.threads)
+        return NativeStepper(self.eager.sized(step_size), self.threads, self._core.plan, self._accuracy)
 
 
 def uncovered(eager: EagerStepper[Any]) -> str:

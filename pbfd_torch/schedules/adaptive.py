@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from typing import Generic, Self
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
-from pbfd_torch.stepping.eager import EagerStepper
-from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
+from pbfd_torch.stepping.accuracy import Accuracy
+from pbfd_torch.stepping.stepper import Solver, Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
@@ -35,19 +33,11 @@ ORDER = 3  # of the error of one step
 class AdaptiveStepper(Generic[S]):
     """A `Stepper` whose steps, the frames, are made of as many shorter ones as each world needs.
 
-    `fixed`: makes the steps; its own step is the length of a frame, and of the longest step [s]. `accuracy`: what a step's end may
-    be off by, as estimated [m] > 0: the root mean square over the mass of a link, the largest of all links. `shortest`: a step that
-    is never refused [s]; None: dt/4096. Raises `InputError` where one of the two is out of range."""
+    `fixed`: makes the steps; its own step is the length of a frame, and of the longest step [s]."""
 
-    def __init__(self, fixed: EagerStepper[S], accuracy: float, shortest: float | None = None) -> None:
-        if not (math.isfinite(accuracy) and accuracy > 0):
-            raise InputError(f"accuracy is {accuracy} m: must be > 0 and finite")
-        dt = fixed.dt
+    def __init__(self, fixed: Stepper[S], accuracy: Accuracy) -> None:
         self.fixed = fixed
-        self.accuracy = float(accuracy)
-        self.shortest = max(dt / 4096, 2 * SHORTEST_STEP) if shortest is None else float(shortest)
-        if not 2 * SHORTEST_STEP <= self.shortest <= max(dt, 2 * SHORTEST_STEP):
-            raise InputError(f"shortest is {shortest} s: must be from {2 * SHORTEST_STEP} s to dt, {dt} s")
+        self.accuracy = accuracy
 
     @property
     def scene(self) -> Scene:
@@ -100,7 +90,7 @@ class AdaptiveStepper(Generic[S]):
         """See `Stepper`: frames of another length."""
         return self._of(self.fixed.sized(step_size))
 
-    def _of(self, fixed: EagerStepper[S]) -> Self:
+    def _of(self, fixed: Stepper[S]) -> Self:
         other = copy.copy(self)
         other.fixed = fixed
         return other
@@ -139,20 +129,20 @@ class _Frame(Generic[S]):
         h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left) - 1e-6)
         held = None if self._control is None else worlds.pick(self._control, 1)
         part, integrator = self._fixed.take(worlds), self._fixed.integrator
-        a = part.articulation
+        a = part.scene.articulation
         whole, half = part.sized(h), part.sized(0.5 * h)
         coarse, first, _ = whole.made(integrator.resized(a, now, spacing, h), held)
         middle, second, _ = half.made(integrator.resized(a, now, spacing, 0.5 * h), held)
         end, third, _ = half.made(middle, held)
         end = replaced(end, hazards=now.hazards | middle.hazards | end.hazards)
 
-        error = apart(a, coarse.q, end.q)
+        error, accuracy = apart(a, coarse.q, end.q), self._stepper.accuracy
         broken = third.status == int(Status.NON_FINITE)
-        shortest = h <= 1.001 * self._stepper.shortest  # not but for rounding
-        taken = broken | shortest | ((error <= self._stepper.accuracy) & second.solved & third.solved)
-        factor = (SAFETY * (self._stepper.accuracy / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
+        shortest = h <= 1.001 * accuracy.shortest  # not but for rounding
+        taken = broken | shortest | ((error <= accuracy.length) & second.solved & third.solved)
+        factor = (SAFETY * (accuracy.length / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
         factor = torch.where(taken, factor, factor.clamp_max(0.5))
-        pace = (h * factor).clamp(self._stepper.shortest, self._stepper.dt)
+        pace = (h * factor).clamp(accuracy.shortest, self._stepper.dt)
 
         everywhere = torch.ones_like(taken)
         self._elapsed = put(self._elapsed, worlds.rows(self._elapsed) + torch.where(broken, left, h), worlds, taken)
@@ -189,17 +179,19 @@ class _Frame(Generic[S]):
         """The state at the end, how the frame was solved, and its way with the balance of the last step of every world."""
         last = self._fixed.sized(self._spacing)
         objective = last.objective(self._before, self._control)
-        a, size = self._fixed.articulation, self._fixed.step_size
+        a, size = self._fixed.scene.articulation, self._fixed.step_size
         state = self._fixed.integrator.resized(a, self._state, self._spacing, size)
         way = Way(state.q, (), objective)
         return replaced(state, pace=self._pace), dataclasses.replace(self._solution, q=state.q), way
 
 
 def apart(articulation: Articulation, first: Tensor, second: Tensor) -> Tensor:
-    """How far two configurations are apart [m] `[*batch]`: √(tr(D S Dᵀ)/m), D the difference of a link's poses, of the link for
-    which it is the largest. Links without mass do not count."""
+    """How far two configurations are apart [m] `[*batch]`: √(tr(D S Dᵀ)/m), D the difference of a body's poses, of the body for
+    which it is the largest. Links that are fixed to each other are one body; those without mass do not count."""
+    t = articulation.topology
     moved = (place(articulation, first).poses - place(articulation, second).poses)[..., :3, :]
     square = ((moved @ articulation.pseudo_inertia) * moved).sum((-2, -1))
-    mass = articulation.mass
+    body = torch.tensor(t.link_node, device=first.device)
+    square, mass = (x.new_zeros(*x.shape[:-1], t.njoint + 1).index_add(-1, body, x) for x in (square, articulation.mass))
     heavy = mass > 0
     return torch.where(heavy, square / torch.where(heavy, mass, torch.ones_like(mass)), 0.0).amax(-1).clamp_min(0).sqrt()

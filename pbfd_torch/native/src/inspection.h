@@ -1,5 +1,6 @@
 // The balance of forces of a step at any configuration, for those who judge it.
 #pragma once
+#include "fitted.h"
 #include "integrators.h"
 
 namespace pbfd {
@@ -12,7 +13,7 @@ inline void inspect(const Plan<T, D>& plan, const T* behind, const T* q, const T
   Balance<T, T, D> balance(plan, arena);
   T* room = arena.take(18 * plan.nodes);
   balance.dt = dt, balance.share = T(0.5), balance.contacts.grip = plan.contact.grip, balance.recall(behind);
-  for (int j = 0; j < plan.nv; j++) balance.fitted[j] = plan.share[j];
+  fit(plan, 0, dt, balance.fitted);
   for (int j = 0; j < plan.nu; j++) balance.control[j] = control[j];
   balance.carriers.load(0, from, to);
   begin_energy_momentum(balance, q, v, room);

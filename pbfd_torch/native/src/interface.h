@@ -14,7 +14,7 @@ PBFD_FUNCTION const char* pbfd_target();
 
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
-  int bytes, dimension, nodes, nq, nv, nu, halvings, candidates, anchors, planes, solids, samples, forms, uncommon, pushes;
+  int bytes, dimension, nodes, nq, nv, nu, candidates, anchors, planes, solids, samples, forms, uncommon, pushes;
   int varied;  // numbers of which each world has its own: others than μ in space only, and not of BDF2
   const int* whole;
   const void* real;
@@ -34,7 +34,10 @@ struct pbfd_plan {
 //   found: what is given, after each step, [steps, …];
 //   residual_norm, counted (status, evaluations, iterations, hazards): [steps, worlds]; fallbacks: [steps, worlds, 4].
 struct pbfd_steps {
-  double dt, tolerance;
+  const void* dt;  // [s], of all worlds, or [worlds] of each
+  int alike;       // whether it is that of all
+  int halvings;    // how often a step may be halved
+  double tolerance;
   double surplus;  // of energy–momentum
   double share;    // of the chord at which inertia works: 1 implicit Euler, less the variational scheme
   double jump;     // of BDF2 [weights]
@@ -53,6 +56,15 @@ struct pbfd_steps {
   // `Timetable`; timed: 1, or all worlds
   const void* poses = nullptr;
   int timed = 1;
+  // how steps were made, see `Ways`: [steps, worlds], [steps, worlds, 2^halvings] and [steps, worlds, 2^halvings, nq]; null: not asked
+  int *halved = nullptr, *eased = nullptr;
+  void* ends = nullptr;
+  // of frames, if accuracy > 0, see `Frames`: [worlds], and [steps, worlds, …]; nothing moves but the bodies
+  double accuracy = 0, shortest = 0;
+  const void* wish = nullptr;
+  void *pace = nullptr, *spacing = nullptr;
+  int* made = nullptr;
+  void* before_last[10] = {};
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.
@@ -89,8 +101,11 @@ struct pbfd_roster {
 //     of the state after each step, [steps, …];
 //   contact_depth [slots], contact_point, contact_normal, contact_force, contact_slip [slots, 3], suspect: of each step, [steps, …];
 //     if suspect is null nothing of these is asked for, and what is `given` does not count.
+// Of frames, what is `given` are the states before the last of their steps, and `spacing` its length, [steps, …].
 struct pbfd_record {
-  double dt;
+  const void* dt;
+  int alike;
+  const void* spacing;
   int worlds, first, last;
   const void* given[10];
   const void* found[10];

@@ -12,7 +12,19 @@ enum Fallback { WARM_START, CONTINUATION, EASIER_STEP, HALVING, FALLBACKS };  //
 // again as an easier one or from the first of shorter parts on, or the same part as an easier one; or the next part follows.
 enum Then { END, END_AT_BEST, END_OF_PARTS, EASE, HALVE, EASE_PART, NEXT_PART };
 
-template <class T> struct Itinerary {
+// What has been spent, and how it ended, or its best end so far.
+template <class T> struct Tally {
+  int evaluations, iterations, counts[FALLBACKS], status, hazards;
+  T error;
+
+  void begin() {
+    evaluations = iterations = status = hazards = 0, error = T(0);
+    for (int& x : counts) x = 0;
+  }
+};
+
+template <class T> struct Itinerary : Tally<T> {
+  using Tally<T>::evaluations, Tally<T>::counts, Tally<T>::status, Tally<T>::hazards, Tally<T>::error;
   int easier;  // how many easier steps the scheme has
   // the attempt
   int halvings, part;  // of 2^halvings parts; 0: of the whole step
@@ -21,15 +33,11 @@ template <class T> struct Itinerary {
   // the step
   int tried, wanted;
   bool may_ease;  // parts
-  int evaluations, iterations, counts[FALLBACKS];
-  // how the step has ended, or its best end so far
-  int status, hazards;
-  T error;
+  int kept;       // which of the easier steps has the best end so far, as `eased`
 
   void begin(const Rules& rules, int steps) {
-    halvings = part = tried = wanted = evaluations = iterations = hazards = eased = 0;
-    easier = steps, limit = rules.evaluations;
-    for (int& x : counts) x = 0;
+    Tally<T>::begin();
+    halvings = part = tried = wanted = eased = kept = 0, easier = steps, limit = rules.evaluations;
   }
 
   bool whole() const { return halvings == 0; }
@@ -47,7 +55,7 @@ template <class T> struct Itinerary {
     const bool solved = ended <= HALVED;
     if (!whole()) return after_part(rules, ended, reached, found);
     if (first() || solved || reached < infinite<T>())
-      status = eased && solved ? int(EASED) : ended, error = reached, hazards = found;
+      status = eased && solved ? int(EASED) : ended, error = reached, hazards = found, kept = eased;
     if (solved || status == NON_FINITE) return END;
     return further(rules);
   }

@@ -11,7 +11,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 10; }
+int pbfd_interface() { return 12; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -21,7 +21,7 @@ namespace {
 
 Sizes sizes(const pbfd_plan* p) {
   const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
-  return {contact, p->nodes, p->nq, p->nv, p->nu, p->halvings, p->pushes,
+  return {contact, p->nodes, p->nq, p->nv, p->nu, p->pushes,
           {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}, p->moving};
 }
 
@@ -30,13 +30,15 @@ template <class T, class A> Timetable<T> timetable(const pbfd_plan* p, const A* 
 }
 
 template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, const void* const* given, void* const* found) {
-  return {s->worlds, s->steps, s->held != 0, given, static_cast<const T*>(s->control), found,
-          static_cast<T*>(s->residual_norm), s->counted[0], s->counted[1], s->counted[2], s->counted[3], s->fallbacks,
-          timetable<T>(p, s)};
+  auto real = [](void* array) { return static_cast<T*>(array); };
+  return {s->worlds, s->steps, s->held != 0, s->alike != 0, static_cast<const T*>(s->dt), given,
+          static_cast<const T*>(s->control), found, real(s->residual_norm), s->counted[0], s->counted[1], s->counted[2],
+          s->counted[3], s->fallbacks, timetable<T>(p, s), {s->halved, s->eased, real(s->ends)},
+          {static_cast<const T*>(s->wish), real(s->pace), real(s->spacing), s->made, s->before_last}};
 }
 
-Rules rules(const pbfd_plan* p, const pbfd_steps* s) {
-  return {s->dt, s->tolerance, s->surplus, s->share, s->jump, p->halvings, s->evaluations};
+Rules rules(const pbfd_steps* s) {
+  return {s->tolerance, s->surplus, s->share, s->jump, s->halvings, s->evaluations, s->accuracy, s->shortest};
 }
 
 template <class N, int D> Plan<N, D> plan_of(const pbfd_plan* p, const N* numbers) {
@@ -81,7 +83,7 @@ template <template <class, class, int> class Scheme> struct Going {
                    Arena<V>& arena) {
     Machine<V, N, D, Scheme<V, N, D>> machine(plan, own, arena);
     machine.newton.balance.contacts.grip = grip;
-    machine.run(journey<typename Kind<V>::Scalar>(p, s, s->given, s->found), rules(p, s), s->first, s->last);
+    machine.run(journey<typename Kind<V>::Scalar>(p, s, s->given, s->found), rules(s), s->first, s->last);
   }
 };
 
@@ -94,7 +96,7 @@ template <template <class, class, int> class Scheme> struct Starting {
     Starts<V, N, D, Scheme<V, N, D>> starts(plan, own, arena);
     starts.balance.contacts.grip = grip;
     const void* before[] = {s->given[0], s->trial[0], s->trial[1], s->trial[2]};
-    Rules trial = rules(p, s);
+    Rules trial = rules(s);
     trial.share = 1;
     const T* speeds = static_cast<const T*>(s->given[1]);
     starts.run(journey<T>(p, s, before, s->trial + 3), trial, s->trial, speeds, s->found, s->first, s->last);
@@ -108,8 +110,8 @@ void balance_of(const pbfd_plan* p, const pbfd_steps* s, const void* q, void* re
     for (int w = s->first; w < s->last; w++) {
       own.load(0, w);
       inspect(plan, plan.remembered() ? row(s->given[9], w, plan.remembered()) : nullptr, row(s->given[0], w, p->nq),
-              row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), T(s->dt),
-              timetable<T>(p, s).at(0, w), timetable<T>(p, s).at(1 << p->halvings, w), arena,
+              row(s->given[1], w, p->nv), row(s->control, w, p->nu), row(q, w, p->nq), *row(s->dt, s->alike ? 0 : w, 1),
+              timetable<T>(p, s).at(0, w), timetable<T>(p, s).at(1 << s->halvings, w), arena,
               static_cast<T*>(residual) + long(w) * p->nv, static_cast<T*>(jacobian) + long(w) * p->nv * p->nv);
     }
   });
@@ -144,7 +146,7 @@ template <template <class, class, int> class Scheme> struct Recording {
     auto out = [](void* array) { return static_cast<T*>(array); };
     const Roster<T> roster{r->links, r->slots, r->first_limit, r->own != 0,
                            r->carrier, r->slot, r->danger, r->meeting_slot, r->meeting_danger, static_cast<const T*>(r->real)};
-    const Record<T> record{T(a->dt), a->worlds, a->given, a->found, a->hazards, timetable<T>(p, a), out(a->q), out(a->v), out(a->link_poses),
+    const Record<T> record{static_cast<const T*>(a->dt), a->alike != 0, static_cast<const T*>(a->spacing), a->worlds, a->given, a->found, a->hazards, timetable<T>(p, a), out(a->q), out(a->v), out(a->link_poses),
                            out(a->center_of_mass), out(a->kinetic_energy), out(a->potential_energy), out(a->linear_momentum),
                            out(a->angular_momentum), out(a->contact_depth), out(a->contact_point), out(a->contact_normal),
                            out(a->contact_force), out(a->contact_slip), a->suspect};

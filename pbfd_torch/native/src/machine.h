@@ -3,22 +3,44 @@
 #pragma once
 #include "bdf2.h"
 #include "energy_momentum.h"
+#include "fitted.h"
+#include "frames.h"
 #include "implicit_euler.h"
-#include "itinerary.h"
 #include "standstill.h"
 
 namespace pbfd {
 
+// How steps were made, for those who follow them back: each as 2^halved parts, whose ends and easier steps are listed [halved, nq];
+// null: nobody does.
+template <class T> struct Ways {
+  int *halved, *eased;
+  T* ends;
+};
+
+// What frames are given and leave beside states, see frames.h: how long the next step had better be, of how many steps they are
+// made, and the states before the last of these and its length. Null where steps are no frames.
+template <class T> struct Frames {
+  const T* wish;
+  T *pace, *spacing;
+  int* made;
+  void* const* before_last;
+};
+
 // What one call is asked for: arrays as interface.h has them.
 template <class T> struct Journey {
   int worlds, steps;
-  bool held;
+  bool held, alike;  // one control for all steps; one length of steps for all worlds
+  const T* dt;
   const void* const* given;
   const T* control;
   void* const* found;
   T* residual_norm;
   int *status, *evaluations, *iterations, *hazards, *fallbacks;
   Timetable<T> timetable;
+  Ways<T> ways;
+  Frames<T> frames;
+
+  T step(int world) const { return dt[alike ? 0 : world]; }
 };
 
 template <class V, class N, int D, class Scheme> struct Machine {
@@ -33,18 +55,24 @@ template <class V, class N, int D, class Scheme> struct Machine {
   Sight<V, N, D> sight;
   Scheme scheme;
   State before, after, origin, best;  // of the attempt; of the whole step
-  V *guess, *from, *found, *velocity;
+  State base, middle, last;           // of a frame: before and half way through the step, and before the last part that is kept
+  Poses<V> reached[2];                // of the step as a whole, and of its halves
+  V *guess, *from, *found, *velocity, *coarse, *axes;
 
   static int room(Sizes s) {
-    return Newton<V, N, D>::room(s) + Sight<V, N, D>::room(s) + Scheme::room(s) + 4 * room_for<State>(s) + 3 * s.nq + s.nv;
+    return Newton<V, N, D>::room(s) + Sight<V, N, D>::room(s) + Scheme::room(s) + 7 * room_for<State>(s) + 4 * s.nq +
+           2 * (D * D + D) * s.nodes + (1 + turns(D) + D) * s.nv;
   }
   Machine(const Plan<N, D>& scene, Numbers<V>& numbers, Arena<V>& arena)
       : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
+    base = taken<State>(arena, plan), middle = taken<State>(arena, plan), last = taken<State>(arena, plan);
+    for (Poses<V>& end : reached) end = Poses<V>::template in<D>(arena, plan);
     newton.balance.recall(before.behind);
     sight.there.carriers = newton.balance.now.carriers;
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
+    coarse = arena.take(plan.nq), axes = arena.take((turns(D) + D) * plan.nv);
   }
 
   // All steps of worlds first … last − 1. Those that remain unsolved go on from the best that was found.
@@ -55,6 +83,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     newton.running = eased = anew = M(false);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
+    if (paced()) set_base(fresh);
     while (any_aboard()) {
       set_out(fresh);
       do newton.pass();
@@ -72,6 +101,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
   int step[W];   // of that world
   Itinerary<T> trips[W];
   Fallbacks<T> ways[W];
+  Frame<T> frames[W];
+  V whole;          // length of its step, before that is halved
   bool plainly[W];  // it is posed the step itself
   M eased;          // it is posed an easier step
   M anew;           // it is posed another step than before
@@ -97,7 +128,15 @@ template <class V, class N, int D, class Scheme> struct Machine {
     depart(i);
     return more;
   }
-  void depart(int i) { steer(i), trips[i].begin(rules, scheme.easier), attempt(i); }
+  void depart(int i) {
+    steer(i);
+    const T dt = journey->step(whose(i));
+    if (paced()) frames[i].begin(dt, step[i] ? frames[i].pace : journey->frames.wish[whose(i)]);
+    embark(i, paced() ? frames[i].next() : dt);
+  }
+  void embark(int i, T dt) { put(whole, i, dt), trips[i].begin(rules, scheme.easier), attempt(i); }
+  bool paced() const { return journey->frames.pace; }
+  int whose(int i) const { return world[i] < 0 ? end - 1 : world[i]; }  // whose numbers it has
   void attempt(int i) { put(anew, i, true), ways[i].begin(), pose(i); }
 
   // What a lane is to solve next. Most have just made a step, and are to make one.
@@ -105,14 +144,17 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (plan.moving > 0) move_obstacles(i);
     const bool plain = trips[i].first() && ways[i].way == DIRECTLY;
     if (plain && plainly[i]) return;
-    plainly[i] = plain;
+    plainly[i] = plain && !paced();
     Balance<V, N, D>& b = newton.balance;
     const int halvings = trips[i].halvings;
     const Stage problem = ways[i].problem();
     const Start start = ways[i].start();
-    put(b.dt, i, T(rules.dt / (1 << halvings))), put(b.share, i, T(scheme.share(trips[i].eased))), put(eased, i, trips[i].eased > 0);
-    for (int j = 0; j < plan.nv; j++)
-      put(b.fitted[j], i, Scheme::fits ? T(lane(plan.share[halvings * plan.nv + j], i)) : T(1));
+    const T dt = lane(whole, i) / T(1 << halvings);
+    put(b.dt, i, dt), put(b.share, i, T(scheme.share(trips[i].eased))), put(eased, i, trips[i].eased > 0);
+    if (Scheme::fits)
+      fit(plan, i, dt, b.fitted);
+    else
+      for (int j = 0; j < plan.nv; j++) put(b.fitted[j], i, T(1));
     put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
     put(b.relaxed.length, i, T(problem.length)), put(b.relaxed.lagged, i, problem.lagged);
     put(newton.tolerance, i, T(ways[i].tolerance(rules.tolerance)));
@@ -124,9 +166,9 @@ template <class V, class N, int D, class Scheme> struct Machine {
   // They go from where they are when it begins to where they are when it ends.
   void move_obstacles(int i) {
     const Timetable<T>& table = journey->timetable;
-    const int from = world[i] < 0 ? end - 1 : world[i];
-    const long lasts = (1 << plan.halvings) >> trips[i].halvings, begins = (long(step[i]) << plan.halvings) + trips[i].part * lasts;
-    newton.balance.carriers.load(i, table.at(begins, from), table.at(begins + lasts, from));
+    const long lasts = (1 << rules.halvings) >> trips[i].halvings;
+    const long begins = (long(step[i]) << rules.halvings) + trips[i].part * lasts;
+    newton.balance.carriers.load(i, table.at(begins, whose(i)), table.at(begins + lasts, whose(i)));
   }
 
   // Lanes are served together: what it costs to end a step is the same for one lane and for all.
@@ -247,6 +289,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       const bool worth = trip.whole() && (trip.first() || ways[i].error < infinite<T>());
       int how = lane(lost, i) ? int(NON_FINITE) : ways[i].status;
       if (how <= HALVED && lane(refused, i)) how = STALLED;
+      if (!trip.whole() && journey->ways.ends) note_part(i);
       const Then then = trip.after(rules, how, ways[i].error, seen.bits(i));
       const bool end = then <= END_OF_PARTS;
       put(ends, i, end), put(fresh, i, !end), put(kept, i, worth && then != END);
@@ -255,22 +298,24 @@ template <class V, class N, int D, class Scheme> struct Machine {
       put(shorter, i, then == HALVE), put(further, i, then == NEXT_PART);
     }
     copy(plan, kept, after, best), copy(plan, from_best, best, after);
-    if (any(from_parts)) scheme.resize(from_parts, b.dt, V(T(rules.dt)), after);
+    if (any(from_parts)) scheme.resize(from_parts, b.dt, whole, after);
     copy(plan, back, origin, before), copy(plan, further, after, before);
     for (int i = 0; i < W; i++)
       if (lane(fresh, i)) attempt(i);
-    if (any(shorter)) scheme.resize(shorter, V(T(rules.dt)), b.dt, before);
+    if (any(shorter)) scheme.resize(shorter, whole, b.dt, before);
     return any(ends) ? fresh | deliver(ends) : fresh;
   }
 
   // Lanes whose step has ended hand it over and go on; who sets out now. Worlds that got lost are where they were.
   M deliver(M ends) {
-    M gone = ends & got_lost(V(T(rules.dt))), fresh(false), same(false);
+    M gone = ends & got_lost(whole), fresh(false), same(false);
     for (int i = 0; i < W; i++) put(gone, i, lane(gone, i) || (lane(ends, i) && trips[i].status == NON_FINITE));
     copy(plan, gone, before, after);
-    for (int i = 0; i < W; i++) {
-      if (!lane(ends, i)) continue;
+    for (int i = 0; i < W; i++)
       if (lane(gone, i)) trips[i].status = NON_FINITE, trips[i].hazards = 0;
+    const M begin = paced() ? pace(ends, fresh) : ends;
+    for (int i = 0; i < W; i++) {
+      if (!lane(begin, i)) continue;
       store(i), report(i);
       if (++step[i] == journey->steps)
         put(fresh, i, board(i));
@@ -278,7 +323,56 @@ template <class V, class N, int D, class Scheme> struct Machine {
         put(fresh, i, true), put(same, i, true), depart(i);
     }
     copy(plan, same, after, before);
+    if (paced()) set_base(begin);
     return fresh;
+  }
+
+  // Lanes whose step is part of a frame go on with the next half or step, and set out now; whose frame has ended.
+  M pace(M ends, M& fresh) {
+    M whole_step(false), half(false), judged(false), taken(false), again(false), over(false);
+    for (int i = 0; i < W; i++) {
+      if (!lane(ends, i)) continue;
+      frames[i].add(trips[i]);
+      const Half made = frames[i].half;
+      put(whole_step, i, made == WHOLE), put(half, i, made == FIRST_HALF), put(judged, i, made == SECOND_HALF);
+    }
+    for (int i = 0; i < plan.nq; i++) coarse[i] = select(whole_step, after.q[i], coarse[i]);
+    copy(plan, half, after, middle), copy(plan, half, after, before);
+    V off(0);
+    if (any(judged)) {
+      place(plan, coarse, reached[0], axes), place(plan, after.q, reached[1], axes);
+      off = apart(plan, reached[0], reached[1]);
+    }
+    for (int i = 0; i < W; i++) {
+      if (!lane(ends, i)) continue;
+      Frame<T>& frame = frames[i];
+      if (lane(judged, i)) put(taken, i, frame.judge(rules, lane(off, i)));
+      const bool ended = lane(taken, i) && frame.over();
+      put(over, i, ended), put(again, i, !ended && !lane(half, i)), put(fresh, i, !ended);
+      if (ended) continue;
+      if (lane(judged, i))
+        frame.set_out();
+      else
+        frame.half = Half(frame.half + 1);
+      embark(i, frame.next());
+    }
+    copy(plan, taken, after, base), copy(plan, taken, middle, last);
+    copy(plan, again, base, before), copy(plan, over, base, after);
+    if (any(again)) scheme.resize(again, spacing(), whole, before);
+    if (any(over)) scheme.resize(over, spacing(), lengths(), after);
+    return over;
+  }
+  // The first step of these lanes' frames sets out from where they are.
+  void set_base(M begin) {
+    copy(plan, begin, before, base);
+    scheme.resize(begin, lengths(), whole, before);
+  }
+  V spacing() const { return of_frames([](const Frame<T>& x) { return x.spacing; }); }
+  V lengths() const { return of_frames([](const Frame<T>& x) { return x.length; }); }
+  template <class F> V of_frames(F&& which) const {
+    V x(0);
+    for (int i = 0; i < W; i++) put(x, i, which(frames[i]));
+    return x;
   }
 
   // Whose state after a step Δt is none that a step may start from.
@@ -298,12 +392,12 @@ template <class V, class N, int D, class Scheme> struct Machine {
 
   // Between a lane and the arrays.
   void steer(int i) {
-    const int from = world[i] < 0 ? end - 1 : world[i];
-    const long row = (journey->held ? 0 : long(step[i]) * journey->worlds) + from;
+    const long row = (journey->held ? 0 : long(step[i]) * journey->worlds) + whose(i);
     for (int j = 0; j < plan.nu; j++) put(newton.balance.control[j], i, journey->control[row * plan.nu + j]);
   }
   void load(int i, int from) {
-    if (own.varied) own.load(i, from), plainly[i] = false;  // θ may be another
+    if (own.varied || !journey->alike) plainly[i] = false;  // θ may be another
+    if (own.varied) own.load(i, from);
     int k = 0;
     State::each(plan, [&](auto member, int width) {
       const T* array = static_cast<const T*>(journey->given[k++]) + long(from) * width;
@@ -311,20 +405,37 @@ template <class V, class N, int D, class Scheme> struct Machine {
     });
   }
   void store(int i) const {
-    const long to = long(step[i]) * journey->worlds + world[i];
+    store(i, after, journey->found);
+    if (paced()) store(i, last, journey->frames.before_last);
+  }
+  void store(int i, const State& state, void* const* arrays) const {
+    const long to = at(i);
     int k = 0;
     State::each(plan, [&](auto member, int width) {
-      T* array = static_cast<T*>(journey->found[k++]) + to * width;
-      for (int j = 0; j < width; j++) array[j] = lane((after.*member)[j], i);
+      T* array = static_cast<T*>(arrays[k++]) + to * width;
+      for (int j = 0; j < width; j++) array[j] = lane((state.*member)[j], i);
     });
   }
+  long at(int i) const { return long(step[i]) * journey->worlds + world[i]; }
   void report(int i) const {
     const Journey<T>& a = *journey;
-    const auto& trip = trips[i];
-    const long at = long(step[i]) * a.worlds + world[i];
-    a.residual_norm[at] = trip.error, a.status[at] = trip.status, a.hazards[at] = trip.hazards;
-    a.evaluations[at] = trip.evaluations, a.iterations[at] = trip.iterations;
-    for (int j = 0; j < FALLBACKS; j++) a.fallbacks[at * FALLBACKS + j] = trip.counts[j];
+    const Tally<T>& tally = paced() ? static_cast<const Tally<T>&>(frames[i]) : trips[i];
+    const long to = at(i);
+    a.residual_norm[to] = tally.error, a.status[to] = tally.status, a.hazards[to] = tally.hazards;
+    a.evaluations[to] = tally.evaluations, a.iterations[to] = tally.iterations;
+    for (int j = 0; j < FALLBACKS; j++) a.fallbacks[to * FALLBACKS + j] = tally.counts[j];
+    if (paced()) a.frames.pace[to] = frames[i].pace, a.frames.spacing[to] = frames[i].spacing, a.frames.made[to] = frames[i].made;
+    if (!a.ways.ends) return;
+    a.ways.halved[to] = trips[i].halvings;
+    if (trips[i].whole()) note(i, 0, trips[i].kept, after.q);
+  }
+
+  // How a part of a step was made, and where it has ended.
+  void note_part(int i) const { note(i, trips[i].part, trips[i].eased, newton.q); }
+  void note(int i, int part, int eased, const V* q) const {
+    const long to = (at(i) << rules.halvings) + part;
+    journey->ways.eased[to] = eased;
+    for (int j = 0; j < plan.nq; j++) journey->ways.ends[to * plan.nq + j] = lane(q[j], i);
   }
 };
 

@@ -16,7 +16,7 @@ inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0;
 constexpr int PARTICULARS = 7;  // of a law: α, e, γ, μ_s − μ_k, 1/v_s [s/m]; restitution (0: none), and its threshold [m/s]
 
 struct Sizes : CandidateSizes {
-  int nodes, nq, nv, nu, halvings, pushes;
+  int nodes, nq, nv, nu, pushes;
   BodySizes bodies = {};
   int moving = 0;  // obstacles
 
@@ -36,7 +36,7 @@ template <class N, int D = 3> struct Plan : Sizes {
   const N *scale;  // what counts as a force of one
   const N *heft;   // [kg, kg m] what rounded positions weigh
   const N *turns;  // 1 where it rotates, else 0
-  const N *share;  // θ of springs, damping and actuators (`Fitted`), 1 where all is implicit: [nv] of steps Δt, Δt/2, Δt/4 …
+  const N *felt;   // inertia that springs, damping and actuators are fitted to, see fitted.h
   const N *spring, *damping, *armature, *dry, *lower, *upper, *limit;
   const N *rest;  // [nq] of the springs
   // actuators
@@ -70,7 +70,7 @@ template <class N, int D = 3> struct Plan : Sizes {
     actuated_q = whole(nu), actuated_v = whole(nu);
     frame = real(D * D * nodes), origin = real(D * nodes), reference = real(nodes), sense = real(nodes);
     mass = real(nodes), center = real(D * nodes), second = real(D * D * nodes), carried = real(nodes);
-    scale = real(nv), heft = real(nv), turns = real(nv), share = real(nv * (1 + halvings));
+    scale = real(nv), heft = real(nv), turns = real(nv), felt = real(nv);
     spring = real(nv), damping = real(nv), armature = real(nv), dry = real(nv);
     lower = real(nv), upper = real(nv), limit = real(nv), rest = real(nq);
     gear = real(nu), gain = real(nu), bias = real(nu), stiffness = real(nu), resistance = real(nu);
@@ -89,7 +89,7 @@ template <class N, int D = 3> struct Plan : Sizes {
            Candidates<N, D>::whole_numbers(s);
   }
   static int real_numbers(Sizes s) {
-    return (2 * D * (D + 1) + 4) * s.nodes + (11 + s.halvings) * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes +
+    return (2 * D * (D + 1) + 4) * s.nodes + 11 * s.nv + s.nq + 9 * s.nu + D + 4 + 6 * s.pushes +
            LAWS_OF_A_ROW * s.bodies.rows + PARTICULARS * s.uncommon + 3 * s.moving + Candidates<N, D>::real_numbers(s);
   }
 };

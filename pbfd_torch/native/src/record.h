@@ -8,7 +8,9 @@ namespace pbfd {
 
 // What a record is asked for: arrays as interface.h has them.
 template <class T> struct Record {
-  T dt;
+  const T* dt;
+  bool alike;        // of all worlds
+  const T* spacing;  // [steps] of frames, the length of the last step in each, which what is given sets out from; null: they are none
   int worlds;
   const void *const *given, *const *found;
   const int* hazards;
@@ -47,6 +49,7 @@ template <class V, class N, class Scheme> struct Recorder {
   Balance<V, N, D> balance;
   Scheme scheme;
   State before, after;
+  V dt;  // of the steps or frames
   V *velocity, *rates, *rest, *gap, *guess;
   int world[W];  // in each lane
 
@@ -63,7 +66,7 @@ template <class V, class N, class Scheme> struct Recorder {
   // Of steps first … last − 1 of all steps of all worlds.
   void write(const Record<T>& to, int first, int last) {
     record = &to;
-    balance.dt = V(to.dt), balance.recall(before.behind);
+    balance.recall(before.behind);
     for (at = first; at < last; at += W) {
       count = last - at < W ? last - at : W;
       for (int i = 0; i < W; i++) load(i, at + (i < count ? i : count - 1));
@@ -81,15 +84,16 @@ template <class V, class N, class Scheme> struct Recorder {
   // Between a lane and the arrays.
   void load(int i, int step) {
     world[i] = step % record->worlds;
+    put(dt, i, record->dt[record->alike ? 0 : world[i]]), put(balance.dt, i, record->spacing ? record->spacing[step] : lane(dt, i));
     if (own.varied) own.load(i, world[i]);
     if (const long k = step / record->worlds; plan.moving > 0)
       balance.carriers.load(i, record->timetable.at(k, world[i]), record->timetable.at(k + 1, world[i]));
-    const bool begins = step < record->worlds;
-    const long earlier = begins ? step : step - record->worlds;
+    const bool given = record->spacing || step < record->worlds;
+    const long earlier = given ? step : step - record->worlds;
     int k = 0;
     State::each(plan, [&](auto member, int width) {
       const T* end = static_cast<const T*>(record->found[k]) + long(step) * width;
-      const T* start = static_cast<const T*>(begins ? record->given[k] : record->found[k]) + earlier * width;
+      const T* start = static_cast<const T*>(given ? record->given[k] : record->found[k]) + earlier * width;
       for (int j = 0; j < width; j++) put((after.*member)[j], i, end[j]), put((before.*member)[j], i, start[j]);
       k++;
     });
@@ -110,8 +114,8 @@ template <class V, class N, class Scheme> struct Recorder {
   }
 
   void write_state() {
-    scheme.velocity(after, balance.dt, velocity);
-    scheme.speeds(after, balance.now, balance.axes, velocity, balance.dt, rates);
+    scheme.velocity(after, dt, velocity);
+    scheme.speeds(after, balance.now, balance.axes, velocity, dt, rates);
     V center[D], linear[D], angular[D], levered[D], rotors(0);
     sum_up(center, linear, angular);
     const V potential = stored(center), per_mass = V(1) / listed(roster.mass());

@@ -39,21 +39,23 @@ template <class V, class N, int D, class Scheme> struct Starts {
            int last) {
     const T* q = static_cast<const T*>(trial.given[0]);
     T* back = static_cast<T*>(others[0]);
-    const V dt = V(T(rules.dt));
+    V dt;
     for (int i = 0; i < plan.nv; i++) before.acceleration[i] = V(0);
     for (int i = 0; i < plan.remembered(); i++) before.behind[i] = begun.behind[i] = V(T(i < 3 * plan.anchors ? 0 : -1));
     each_block(first, last, [&] {
       take(q, plan.nq, before.q), take(speeds, plan.nv, v);
+      for (int i = 0; i < W; i++) put(dt, i, trial.step(world(i)));
       retract(plan, before.q, v, -dt, before.q_previous);
       give(before.q_previous, plan.nq, back), give(before.acceleration, plan.nv, static_cast<T*>(others[1]));
       give(before.behind, plan.remembered(), static_cast<T*>(others[2]));
     });
     machine.run(trial, rules, first, last);
-    balance.dt = dt, balance.relaxed.none(), balance.recall(before.behind);
+    balance.relaxed.none(), balance.recall(before.behind);
     each_block(first, last, [&] {
+      for (int i = 0; i < W; i++) put(balance.dt, i, trial.step(world(i)));
       take(q, plan.nq, before.q), take(speeds, plan.nv, v), take(back, plan.nq, before.q_previous);
       for (int i = 0; plan.moving > 0 && i < W; i++)
-        balance.carriers.load(i, trial.timetable.at(0, world(i)), trial.timetable.at(1 << plan.halvings, world(i)));
+        balance.carriers.load(i, trial.timetable.at(0, world(i)), trial.timetable.at(1 << rules.halvings, world(i)));
       take(static_cast<const T*>(trial.found[0]), plan.nq, end), take(trial.control, plan.nu, balance.control);
       M solved;
       for (int i = 0; i < W; i++) put(solved, i, trial.status[world(i)] <= HALVED);
@@ -166,7 +168,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
   void complete(M solved, Velocities<V>& out) {
     Balance<V, N, D>& b = balance;
     b.share = V(0.5);
-    for (int i = 0; i < plan.nv; i++) b.fitted[i] = V(plan.share[i]);
+    for (int i = 0; i < W; i++) fit(plan, i, lane(b.dt, i), b.fitted);
     begin_energy_momentum(b, before.q, v, room_to_begin);
     b.begin(), b.press();
     forces_by_share(b, end, rough, smooth, spare);

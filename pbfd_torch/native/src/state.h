@@ -6,9 +6,10 @@
 namespace pbfd {
 
 struct Rules {
-  double dt, tolerance;         // [s], of ‖r/scale‖
+  double tolerance;             // of ‖r/scale‖
   double surplus, share, jump;  // see `EnergyMomentum`, `Variational`, `Bdf2`
-  int halvings, evaluations;      // how often a step may be halved; at most, with all that is tried
+  int halvings, evaluations;    // how often a step may be halved; at most, with all that is tried
+  double accuracy, shortest;    // of steps that each world chooses the length of, see frames.h; 0: their length is given
 };
 
 template <class State> inline int room_for(Sizes s) {
