@@ -69,6 +69,12 @@ class Simulator(Generic[S]):
             self._made = chosen(self.eager) if engine is None else (engine.stepper(self.eager), engine.name, "")
         return self._made
 
+    def _maker(self, eager: EagerStepper[Any]) -> Stepper[Any]:
+        """What makes the steps of a stepper such as this one's."""
+        if eager is self.eager:
+            return self.stepper
+        return chosen(eager)[0] if self._engine is None else self._engine.stepper(eager)
+
     def _carriers(self) -> Carriers:
         if self._carrying is None:
             self._carrying = Carriers(self.eager)
@@ -154,7 +160,7 @@ class Simulator(Generic[S]):
         q, v = self.scene.placed(q, v)
         control = self.scene.controlled(control, q.shape[:-1])
         if self._carriers().may_carry(q, v, control):
-            linked = Linked(self.eager, self.gradients)
+            linked = Linked(self.eager, self.gradients, self._maker)
             if linked.carry(q, v, control):
                 return linked.initial_state(q, v, control)
         return self.stepper.initial_state(q, v, control)
@@ -170,10 +176,10 @@ class Simulator(Generic[S]):
         shapes, dtypes and devices.
 
         Where the state, the control, the scene's numbers or dt carry derivatives, so does the new state, by the implicit function
-        theorem (`gradients.implicit`); it is then made in PyTorch, and its values are those of `Torch` to the bit."""
+        theorem (`gradients.implicit`); the values are the same to the bit."""
         control = self.scene.controlled(control, state.q.shape[:-1])
         if self._carriers().may_carry(*vars(state).values(), *state.memory, control):
-            linked = Linked(self.eager, self.gradients)
+            linked = Linked(self.eager, self.gradients, self._maker)
             if linked.carry(state, control):
                 advanced, made = linked.step(state, control)
                 return advanced, made.solution
@@ -192,13 +198,13 @@ class Simulator(Generic[S]):
 
         controls, steps: as in `rollout`. checkpoint: keep every so many-th state only, for less memory and about twice the time.
         progress: called with the number of steps done. Raises `InputError` where controls and steps do not agree."""
-        return trajectory(self.eager, self.gradients, state, controls, steps, checkpoint, progress)
+        return trajectory(self.eager, self.gradients, self._maker, state, controls, steps, checkpoint, progress)
 
     def linearize(self, state: S, control: Tensor | None = None) -> Linearization[S]:
         """The step from `state` under `control` `[*batch, nu]` as A `[*batch, nx, nx]` and B `[*batch, nx, nu]` in the coordinates
         of `Chart`: exact derivatives, all worlds and all rows in one pass. Raises `GradientError` at unsolved and singular
         steps unless `gradients` says otherwise."""
-        return linearized(self.eager, self.gradients, state, control)
+        return linearized(self.eager, self.gradients, self._maker, state, control)
 
     def rollout(
         self,
@@ -247,7 +253,7 @@ class AdaptiveSimulator(Simulator[S]):
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but
         not smoothly."""
         control = self.scene.controlled(control, state.q.shape[:-1])
-        if Linked(self.eager, self.gradients).carry(state, control):
+        if Linked(self.eager, self.gradients, self._maker).carry(state, control):
             raise InputError(NO_DERIVATIVES)
         return super().step(state, control)
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.gradients.implicit import Doubt, Doubtful, Gradients, followed
-from pbfd_torch.gradients.linked import complain, doubts_of
+from pbfd_torch.gradients.linked import Engine, complain, doubts_of
 from pbfd_torch.gradients.parts import precise
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.solvers.objective import Solution
@@ -99,10 +99,12 @@ class Chart(Generic[S]):
         return torch.cat(found, -1)
 
 
-def linearized(stepper: EagerStepper[S], gradients: Gradients, state: S, control: Tensor | None) -> Linearization[S]:
+def linearized(
+    stepper: EagerStepper[S], gradients: Gradients, engine: Engine, state: S, control: Tensor | None
+) -> Linearization[S]:
     """See `Simulator.linearize`."""
     nu = stepper.scene.nu
-    end, solution, way = stepper.made(state, control)
+    end, solution, way = engine(stepper).made(state, control)
     doubts = doubts_of(solution.status)
     wide = precise(stepper)
     before, after = (Chart(wide, in_dtype(x, torch.float64)) for x in (state, end))

@@ -20,6 +20,7 @@ from pbfd_torch.gradients.parts import carries, of_parts, parts_of, precise
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.plain import plain, wrapped
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
@@ -47,19 +48,24 @@ class Made:
     factors: list[Factors] | None = None
 
 
+Engine = Callable[[EagerStepper[Any]], Stepper[Any]]
+
+
 class Linked(Generic[S]):
     """The steps of a stepper as functions that carry derivatives.
 
-    `gradients`: how they are differentiated. `active`: the positions, among all tensors of the stepper's parts, of those that carry
-    any."""
+    `gradients`: how they are differentiated. `engine`: what makes steps without derivatives, of the stepper that defines them.
+    `active`: the positions, among all tensors of the stepper's parts, of those that carry any."""
 
-    def __init__(self, stepper: EagerStepper[S], gradients: Gradients) -> None:
+    def __init__(self, stepper: EagerStepper[S], gradients: Gradients, engine: Engine) -> None:
         self.stepper = stepper
         self.gradients = gradients
+        self.engine = engine
         self.parts = parts_of(stepper)
         self.leaves = tensors_of(self.parts)
         self.active = [k for k, x in enumerate(self.leaves) if carries(x) or wrapped(x)]
         self._plain: EagerStepper[S] | None = None
+        self._maker: Stepper[S] | None = None
 
     def carry(self, *values: Any) -> bool:
         """Whether steps from these values carry derivatives."""
@@ -70,6 +76,16 @@ class Linked(Generic[S]):
         if self._plain is None:
             self._plain = self.with_values(values) if self.active else self.stepper
         return self._plain
+
+    def maker(self, stepper: EagerStepper[Any], start: Any) -> Stepper[Any]:
+        """What makes the steps of a stepper without derivatives from such a start."""
+        if any(map(wrapped, tensors_of([start, *self.leaves]))):
+            return stepper  # PyTorch alone looks into the tensors of torch.func
+        if stepper is not self._plain:
+            return self.engine(stepper)
+        if self._maker is None:
+            self._maker = self.engine(stepper)
+        return self._maker
 
     def with_values(self, values: Sequence[Tensor]) -> EagerStepper[S]:
         """The stepper with other values of the active tensors."""
@@ -153,7 +169,7 @@ class Step(Play[S]):
     made: Made | None = None
 
     def first(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> S:
-        end, solution, way = stepper.made(start, control)
+        end, solution, way = self.linked.maker(stepper, start).made(start, control)
         self.made = Made(solution, way.kept(), doubts_of(solution.status), [] if self.linked.gradients.keep_factors else None)
         return end
 
@@ -181,7 +197,7 @@ class _Start(Play[S]):
         self._trials: list[tuple[Way, Tensor]] = []
 
         def attempt(trial: EagerStepper[Any], state: Any, held: Tensor | None) -> tuple[Any, Tensor]:
-            end, solution, way = trial.made(state, held)
+            end, solution, way = self.linked.maker(trial, state).made(state, held)
             self._trials.append((way.kept(), solution.solved))
             return end, solution.solved
 

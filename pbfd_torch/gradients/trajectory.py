@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
-from pbfd_torch.gradients.linked import Linked, Made, Play, doubts_of
+from pbfd_torch.gradients.linked import Engine, Linked, Made, Play, doubts_of
 from pbfd_torch.gradients.parts import carries
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import is_solved
@@ -65,16 +65,16 @@ class _Segment(Play[S]):
 
     def first(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> Any:
         """See `Play`: configurations and velocities after every step, and the last state."""
-        states = [start]
+        states, maker = [start], self.linked.maker(stepper, start)
         for k in range(self._steps):
-            end, solution, _ = stepper.made(states[-1], None if control is None else control[k])
+            end, solution, _ = maker.made(states[-1], None if control is None else control[k])
             states.append(end)
             self.status.append(solution.status)
         return _seen(stepper, states)
 
     def again(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> Any:
         """See `Play`."""
-        states, linked = [start], Linked(stepper, self.linked.gradients)
+        states, linked = [start], Linked(stepper, self.linked.gradients, self.linked.engine)
         self.made.clear()
         for k in range(self._steps):
             end, made = linked.step(states[-1], None if control is None else control[k])
@@ -93,6 +93,7 @@ def _seen(stepper: EagerStepper[S], states: list[S]) -> tuple[Tensor, Tensor, S]
 def trajectory(
     stepper: EagerStepper[S],
     gradients: Gradients,
+    engine: Engine,
     state: S,
     controls: Tensor | None,
     steps: int | None,
@@ -103,7 +104,7 @@ def trajectory(
     if checkpoint < 1:
         raise InputError(f"checkpoint is {checkpoint}: must be a number of steps ≥ 1")
     count = stepper.scene.step_count(controls, steps)
-    linked = Linked(stepper, gradients)
+    linked = Linked(stepper, gradients, engine)
     carrying = linked.carry(state, controls)
     given = tensors_of([state, controls, *linked.leaves])
     if any(carries(x) and not x.requires_grad for x in given):
@@ -128,7 +129,7 @@ def trajectory(
                     solution = made.solution
                     kept.append([made])
                 else:
-                    end, solution, _ = stepper.made(states[-1], now)
+                    end, solution, _ = linked.maker(stepper, state).made(states[-1], now)
                 states.append(end)
                 status.append(solution.status)
             *seen, state = _seen(stepper, states)

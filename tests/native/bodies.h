@@ -11,7 +11,7 @@
 namespace bodies {
 
 constexpr double G = 9.81;
-constexpr int NQ = 7, NV = 6, HALVINGS = 3;
+constexpr int NQ = 7, NV = 6, HALVINGS = 3, PARTS = 8;
 using Numbers = std::vector<double>;
 
 // [mass, moments of inertia] of the body, radius of all candidates at these positions.
@@ -42,14 +42,13 @@ struct Scene {
     add({1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, b.mass, 0, 0, 0});
     add({sum - b.inertia[0], 0, 0, 0, sum - b.inertia[1], 0, 0, 0, sum - b.inertia[2], b.mass});
     const double weight = b.mass * G, reach = 0.1;
-    each(weight, weight * reach), each(b.mass, b.mass * reach), each(0, 1);
-    for (int i = 0; i <= HALVINGS; i++) each(0.5, 0.5);
+    each(weight, weight * reach), each(b.mass, b.mass * reach), each(0, 1), each(b.mass, sum);
     for (int what = 0; what < 4; what++) each(0, 0);  // no springs, damping, rotors, dry friction
     each(-inf, -inf), each(inf, inf), each(0, 0), add({0, 0, 0, 1, 0, 0, 0});
     add({0, 0, -G, reach, 1, 0, 1e-3});
     real.insert(real.end(), b.positions.begin(), b.positions.end());
     all(b.radius), all(0), all(weight / 1e-6), all(0.5), all(0.01), all(1 / 0.1), all(b.anchored ? 1 / 1e-4 : 1 / 1e-3), add({0, 0, 1, 0});
-    plan = {8, 3, 1, NQ, NV, 0, HALVINGS, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, 0, 0, whole.data(), real.data(), nullptr, nullptr};
+    plan = {8, 3, 1, NQ, NV, 0, candidates, b.anchored ? candidates : 0, 1, 0, 0, 0, 0, 0, 0, whole.data(), real.data(), nullptr, nullptr};
     CHECK(pbfd_whole_numbers(&plan) == long(whole.size()));
     CHECK(pbfd_real_numbers(&plan) == long(real.size()));
   }
@@ -63,20 +62,31 @@ struct Run {
   std::vector<int> widths;
   std::vector<Numbers> given, found;
   Numbers residual_norm, trial[7];
-  std::vector<int> counted[4], fallbacks;
+  std::vector<int> counted[4], fallbacks, halved, eased, made;
+  Numbers ends, wish, pace, spacing;  // of ways and frames
+  std::vector<Numbers> before_last;
 
   Run(int count, int length, std::vector<int> sizes) : worlds(count), steps(length), widths(sizes) {
     for (int width : widths) given.emplace_back(width * count), found.emplace_back(width * count * length);
     for (int w = 0; w < count; w++) given[0][w * NQ + 3] = 1;
     residual_norm.resize(count * length), fallbacks.resize(4 * count * length);
     for (auto& x : counted) x.resize(count * length);
+    halved.resize(count * length), eased.resize(PARTS * count * length), ends.resize(PARTS * NQ * count * length);
+    made.resize(count * length), pace.resize(count * length), spacing.resize(count * length), before_last = found;
     for (auto& x : trial) x.resize(count * NQ);
   }
 
-  // own: numbers of each world, where the plan says which these are.
-  void make(const Scene& scene, Step step, double dt, const double* own = nullptr) {
+  // own: numbers of each world, where the plan says which these are. accuracy: of frames, 0: steps, whose ways are asked for.
+  void make(const Scene& scene, Step step, double dt, const double* own = nullptr, double accuracy = 0) {
     void* room = std::aligned_alloc(64, (pbfd_room(&scene.plan) + 127) / 64 * 64);
-    pbfd_steps s{dt, 1e-9, 1e-3, 1, 1e300, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), own, {}};
+    pbfd_steps s{&dt, 1, HALVINGS, 1e-9, 1e-3, 1, 1e300, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), own, {}};
+    if (accuracy > 0) {
+      wish.assign(worlds, dt), s.accuracy = accuracy, s.shortest = dt / 4096;
+      s.wish = wish.data(), s.pace = pace.data(), s.spacing = spacing.data(), s.made = made.data();
+      for (std::size_t i = 0; i < given.size(); i++) s.before_last[i] = before_last[i].data();
+    } else {
+      s.halved = halved.data(), s.eased = eased.data(), s.ends = ends.data();
+    }
     for (std::size_t i = 0; i < given.size(); i++) s.given[i] = given[i].data(), s.found[i] = found[i].data();
     for (int i = 0; i < 4; i++) s.counted[i] = counted[i].data();
     for (int i = 0; i < 7; i++) s.trial[i] = trial[i].data();

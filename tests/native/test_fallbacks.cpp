@@ -42,6 +42,12 @@ void compare(Step step, const std::vector<int>& widths, double dt, int* seen) {
       CHECK(all.status(w, 0) == NON_FINITE);
     } else {
       CHECK(all.same(w, thrown(w, 1, step, widths, dt), 0));
+      for (int k = 0; k < STEPS; k++) {  // the last part ends where the step does
+        const int at = k * WORLDS + w, parts = 1 << all.halved[at];
+        CHECK((parts > 1) == (all.status(w, k) == HALVED));
+        CHECK((all.eased[PARTS * at] > 0) == (all.status(w, k) == EASED) || parts > 1);
+        for (int j = 0; j < NQ; j++) CHECK(all.ends[(PARTS * at + parts - 1) * NQ + j] == all.q(w, k)[j]);
+      }
     }
   }
 }

@@ -32,7 +32,7 @@ std::vector<double> real_numbers() {
   add({2, 1, 0.5}), add({0.1, 0.2, 0, -0.1, 0.1, 0.3, 0, 0.2, 0.1});
   for (int k = 0; k < NODES; k++) add({0.1, 0.01, 0.02, 0.01, 0.2, 0.03, 0.02, 0.03, 0.15});
   add({3.5, 1.5, 0.5});
-  each(1), each(1), each(1), each(0.5);           // scales, hefts, what turns, shares
+  each(1), each(1), each(1), each(0.5);           // scales, hefts, what turns, inertia that is felt
   each(0.3), each(0.2), each(0.1), each(0);       // springs, damping, rotors, no dry friction
   each(-1e9), each(1e9), each(0);                 // no limits
   add({0, 0, 0, 1, 0, 0, 0, 0, 0}), add({0, 0, -9.81, 1, 1, 0, 1e-3});
@@ -42,7 +42,7 @@ std::vector<double> real_numbers() {
 }  // namespace
 
 int main() {
-  const Sizes sizes{{0, 0, 0, 0, 0, 0}, NODES, NQ, NV, 0, 0, 0};
+  const Sizes sizes{{0, 0, 0, 0, 0, 0}, NODES, NQ, NV, 0, 0};
   const std::vector<int> whole = whole_numbers();
   const std::vector<double> real = real_numbers();
   CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));

@@ -27,7 +27,8 @@ struct Seen {
     bodies::Numbers each;
     for (int w = 0; w < WORLDS; w++) each.insert(each.end(), real, real + 19);
     const pbfd_roster roster{1, 2, -1, own, &carrier, &slot, &danger, own ? each.data() : real};
-    pbfd_record record{DT, WORLDS, first, last, {}, {}, run.counted[3].data(), nullptr, q.data(), v.data(), poses.data(),
+    const double dt = DT;
+    pbfd_record record{&dt, 1, nullptr, WORLDS, first, last, {}, {}, run.counted[3].data(), nullptr, q.data(), v.data(), poses.data(),
                        center.data(), kinetic.data(), potential.data(), linear.data(), angular.data(), depth.data(), point.data(),
                        normal.data(), force.data(), slip.data(), suspect.data()};
     for (std::size_t i = 0; i < run.given.size(); i++)

@@ -50,13 +50,13 @@ int main() {
   const Scene scene({1.0, {1, 1, 1}, 0.01, {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0}});
   const pbfd::Plan<double> plan(sizes(&scene.plan), scene.whole.data(), scene.real.data(), nullptr);
   const int mass = int(plan.mass - scene.real.data()), carried = int(plan.carried - scene.real.data());
-  const int grip = int(plan.contact.grip - scene.real.data()), share = int(plan.share - scene.real.data());
+  const int grip = int(plan.contact.grip - scene.real.data()), damping = int(plan.damping - scene.real.data());
   const std::vector<int>* widths[] = {&VELOCITIES, &POSITIONS};
   for (int scheme = 0; scheme < 2; scheme++) {
     const Step step = scheme ? pbfd_implicit_euler : pbfd_energy_momentum;
     compare(step, *widths[scheme], {mass, carried}, 1.0);
     compare(step, *widths[scheme], {grip, grip + 1, grip + 2, grip + 3}, 0.5);
-    compare(step, *widths[scheme], {share, share + 1, share + 2}, 0.7);
+    compare(step, *widths[scheme], {damping, damping + 1, damping + 2}, 0.7);
   }
   compare(pbfd_start_energy_momentum, VELOCITIES, {mass, carried}, 1.0, 1);
   return failures();

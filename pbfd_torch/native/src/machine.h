@@ -6,42 +6,10 @@
 #include "fitted.h"
 #include "frames.h"
 #include "implicit_euler.h"
+#include "journey.h"
 #include "standstill.h"
 
 namespace pbfd {
-
-// How steps were made, for those who follow them back: each as 2^halved parts, whose ends and easier steps are listed [halved, nq];
-// null: nobody does.
-template <class T> struct Ways {
-  int *halved, *eased;
-  T* ends;
-};
-
-// What frames are given and leave beside states, see frames.h: how long the next step had better be, of how many steps they are
-// made, and the states before the last of these and its length. Null where steps are no frames.
-template <class T> struct Frames {
-  const T* wish;
-  T *pace, *spacing;
-  int* made;
-  void* const* before_last;
-};
-
-// What one call is asked for: arrays as interface.h has them.
-template <class T> struct Journey {
-  int worlds, steps;
-  bool held, alike;  // one control for all steps; one length of steps for all worlds
-  const T* dt;
-  const void* const* given;
-  const T* control;
-  void* const* found;
-  T* residual_norm;
-  int *status, *evaluations, *iterations, *hazards, *fallbacks;
-  Timetable<T> timetable;
-  Ways<T> ways;
-  Frames<T> frames;
-
-  T step(int world) const { return dt[alike ? 0 : world]; }
-};
 
 template <class V, class N, int D, class Scheme> struct Machine {
   using T = typename Kind<V>::Scalar;
@@ -289,7 +257,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       const bool worth = trip.whole() && (trip.first() || ways[i].error < infinite<T>());
       int how = lane(lost, i) ? int(NON_FINITE) : ways[i].status;
       if (how <= HALVED && lane(refused, i)) how = STALLED;
-      if (!trip.whole() && journey->ways.ends) note_part(i);
+      if (!trip.whole()) note(i, trip.part, trip.eased, newton.q);
       const Then then = trip.after(rules, how, ways[i].error, seen.bits(i));
       const bool end = then <= END_OF_PARTS;
       put(ends, i, end), put(fresh, i, !end), put(kept, i, worth && then != END);
@@ -398,45 +366,24 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void load(int i, int from) {
     if (own.varied || !journey->alike) plainly[i] = false;  // θ may be another
     if (own.varied) own.load(i, from);
-    int k = 0;
-    State::each(plan, [&](auto member, int width) {
-      const T* array = static_cast<const T*>(journey->given[k++]) + long(from) * width;
-      for (int j = 0; j < width; j++) put((before.*member)[j], i, array[j]);
-    });
+    journey->load(from, i, plan, before);
   }
   void store(int i) const {
-    store(i, after, journey->found);
-    if (paced()) store(i, last, journey->frames.before_last);
+    journey->store(at(i), i, plan, after, journey->found);
+    if (paced()) journey->store(at(i), i, plan, last, journey->frames.before_last);
   }
-  void store(int i, const State& state, void* const* arrays) const {
-    const long to = at(i);
-    int k = 0;
-    State::each(plan, [&](auto member, int width) {
-      T* array = static_cast<T*>(arrays[k++]) + to * width;
-      for (int j = 0; j < width; j++) array[j] = lane((state.*member)[j], i);
-    });
-  }
-  long at(int i) const { return long(step[i]) * journey->worlds + world[i]; }
   void report(int i) const {
-    const Journey<T>& a = *journey;
-    const Tally<T>& tally = paced() ? static_cast<const Tally<T>&>(frames[i]) : trips[i];
-    const long to = at(i);
-    a.residual_norm[to] = tally.error, a.status[to] = tally.status, a.hazards[to] = tally.hazards;
-    a.evaluations[to] = tally.evaluations, a.iterations[to] = tally.iterations;
-    for (int j = 0; j < FALLBACKS; j++) a.fallbacks[to * FALLBACKS + j] = tally.counts[j];
-    if (paced()) a.frames.pace[to] = frames[i].pace, a.frames.spacing[to] = frames[i].spacing, a.frames.made[to] = frames[i].made;
-    if (!a.ways.ends) return;
-    a.ways.halved[to] = trips[i].halvings;
+    journey->report(at(i), paced() ? static_cast<const Tally<T>&>(frames[i]) : trips[i]);
+    if (paced()) journey->frames.note(at(i), frames[i].pace, frames[i].spacing, frames[i].made);
+    if (!journey->ways.ends) return;
+    journey->ways.halved[at(i)] = trips[i].halvings;
     if (trips[i].whole()) note(i, 0, trips[i].kept, after.q);
   }
-
   // How a part of a step was made, and where it has ended.
-  void note_part(int i) const { note(i, trips[i].part, trips[i].eased, newton.q); }
   void note(int i, int part, int eased, const V* q) const {
-    const long to = (at(i) << rules.halvings) + part;
-    journey->ways.eased[to] = eased;
-    for (int j = 0; j < plan.nq; j++) journey->ways.ends[to * plan.nq + j] = lane(q[j], i);
+    if (journey->ways.ends) journey->ways.note((at(i) << rules.halvings) + part, eased, i, q, plan.nq);
   }
+  long at(int i) const { return journey->at(step[i], world[i]); }
 };
 
 }  // namespace pbfd
