@@ -24,10 +24,15 @@ fuzz: .venv/.installed
 sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/native/*.cpp))
 	set -e; for test in $^; do echo $$test; $$test; done
 
-build/sanitized/%: tests/native/%.cpp $(wildcard tests/native/*.h) $(NATIVE)
+SANITIZED := $(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
+	-Wno-bitwise-instead-of-logical -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src
+
+build/sanitized/%: tests/native/%.cpp build/sanitized/library.o $(wildcard tests/native/*.h)
+	$(SANITIZED) -o $@ $< build/sanitized/library.o
+
+build/sanitized/library.o: $(NATIVE)
 	mkdir -p $(@D)
-	$(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
-		-Wno-bitwise-instead-of-logical -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src -o $@ $<
+	$(SANITIZED) -c -o $@ pbfd_torch/native/src/library.cpp
 
 lint: .venv/.installed
 	$(BIN)/ruff check

@@ -62,17 +62,17 @@ def compiled(simulator: Simulator[Any]) -> NativeStepper[Any]:
 def recorded(simulator: Simulator[Any], state: State, controls: Tensor | None, steps: int) -> tuple[Rollout, Rollout]:
     """What the core records of its steps, and what PyTorch's record has of the same states."""
     stepper = compiled(simulator)
-    states, solution = stepper.run(state, controls, steps)
+    stretch = stepper.stretch(state, controls, steps)
     record = stepper.record(state, steps)
-    record.add(state, states, solution)
-    pair = record.finish(), defined(simulator, state, controls, states, solution)
+    record.add(stretch)
+    pair = record.finish(), defined(simulator, state, controls, stretch.states, stretch.solution)
     between = any(isinstance(term, BodyContact) for term in simulator.scene.terms)
     return (in_order(simulator.scene, pair[0]), in_order(simulator.scene, pair[1])) if between else pair
 
 
 def defined(simulator: Simulator[Any], state: State, controls: Tensor | None, states: State, solution: Solution) -> Rollout:
     """PyTorch's record of steps that were made from a state."""
-    record = Recorder(simulator.scene, simulator.integrator, simulator.dt, state)
+    record = Recorder(simulator.scene, simulator.integrator, simulator.dt, simulator.step_size, state)
     for k in range(len(solution.status)):
         after, solved = (mapped(lambda x, k=k: x[k], whole) for whole in (states, solution))
         record.record(after, solved, simulator.objective(state, None if controls is None else controls[k]))
@@ -275,9 +275,9 @@ def test_a_record_does_not_depend_on_batch_lane_or_thread() -> None:
     parts = NativeStepper(simulator.eager, threads=1).record(state, 40)
     at = state
     for first, last in ((0, 1), (1, 13), (13, 40)):
-        states, solution = compiled(simulator).run(at, controls[first:last], last - first)
-        parts.add(at, states, solution)
-        at = mapped(lambda x: x[-1], states)
+        stretch = compiled(simulator).stretch(at, controls[first:last], last - first)
+        parts.add(stretch)
+        at = stretch.end
     threads = Simulator(simulator.scene, 0.008, engine=Native(threads=3)).rollout(state, controls)
     some = torch.tensor([69, 3])
     alone = simulator.rollout(state.take(Worlds((70,), some)), controls[:, some])

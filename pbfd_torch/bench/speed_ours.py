@@ -118,8 +118,7 @@ def definition(course: Course) -> Ours:
 def _run(stepper: Stepper[Velocities], state: Velocities, controls: Tensor) -> tuple[Velocities, Solution]:
     """The states after all steps, and how they were solved, `[steps, worlds, ...]`: the core makes them in one call."""
     if isinstance(stepper, NativeStepper):
-        stretch = stepper.run(state, controls, len(controls))
-        return stretch.states, stretch.solution
+        return stepper.run(state, controls, len(controls))
     states, solutions = [], []
     for control in controls:
         state, solution, _ = stepper.made(state, control)

@@ -110,10 +110,6 @@ class Choices:
     def __post_init__(self) -> None:
         if self.accuracy is not None and self.schedule is Schedule.ASYNCHRONOUS:
             raise InputError("--accuracy lets every world go at its own pace already: leave out --schedule asynchronous")
-        if self.engine is EngineChoice.NATIVE and self.accuracy is not None:
-            raise InputError("--engine is native: must be torch with --accuracy")
-        if self.engine is EngineChoice.NATIVE and self.schedule is Schedule.ASYNCHRONOUS:
-            raise InputError("--engine is native: must be torch with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.workers > 1:
             raise InputError(f"--workers is {self.workers}: must be 1 with --schedule asynchronous")
         if self.schedule is Schedule.ASYNCHRONOUS and self.solver in (SolverChoice.LM, SolverChoice.LBFGS):
@@ -124,10 +120,10 @@ class Choices:
 
     def make_simulator(self, scene: Scene, dt: float) -> Simulator[Any]:
         """Raises `InputError` for a Δt or an accuracy out of range, and for an engine that cannot."""
-        integrator, solver = INTEGRATORS[self.integrator.value](), self.make_solver()
+        integrator, solver, engine = INTEGRATORS[self.integrator.value](), self.make_solver(), _ENGINES[self.engine]
         if self.accuracy is None:
-            return Simulator(scene, dt, integrator, solver, engine=_ENGINES[self.engine])
-        return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver)
+            return Simulator(scene, dt, integrator, solver, engine=engine)
+        return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver, engine=engine)
 
 
 def use_threads(count: int) -> None:

@@ -23,6 +23,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.models import Setup
 from pbfd_torch.records.recording import least_bytes
 from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.schedules.workers import Workers
 from pbfd_torch.solvers.objective import Status
@@ -129,7 +130,7 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     if choices.workers > 1:
         with Workers(choices.workers) as workers:
             rollout = workers.rollout(simulator, state, controls)
-    elif choices.schedule is Schedule.ASYNCHRONOUS:
+    elif choices.schedule is Schedule.ASYNCHRONOUS and simulator.engine == Torch.name:  # in the core no world waits anyway
         with tqdm(total=steps * setup.worlds, unit="step", disable=not sys.stderr.isatty(), leave=False) as bar:
             rollout = AsynchronousRollout(simulator, state, steps, controls).finish(bar.update)
     else:
@@ -138,8 +139,6 @@ def simulated(setup: Setup, choices: Choices, duration: float | None = None, dt:
     wall = time.perf_counter() - started
     if rollout.steps < steps:
         print(f"pbfd: interrupted after {rollout.steps} of {steps} steps; reporting those", file=sys.stderr)
-    if choices.schedule is Schedule.ASYNCHRONOUS:
-        return Result(setup, rollout, choices, wall, "torch", "asynchronous rollouts are made in PyTorch")
     return Result(setup, rollout, choices, wall, simulator.engine, simulator.engine_reason)
 
 

@@ -31,7 +31,7 @@ def rolled_out(
             first = record.steps
             part = min(most, count - first)
             held = None if controls is None else spread(controls[first : first + part], batch)
-            stretch = stepper.run(state, held, part)
+            stretch = stepper.stretch(state, held, part)
             told = _told(progress, first, part)
             record.add(stretch.cut(told))
             if told < part:

@@ -119,7 +119,12 @@ class NativeStepper(Generic[S]):
         way = Way(solution.q) if ways is None else ways.way(self.integrator, solution.q)
         return self._after(state, journey, state.time + self.step_size), solution, way
 
-    def run(self, state: S, controls: Tensor | None, steps: int) -> Stretch[S]:
+    def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
+        """The states after each of so many steps, `[steps, *batch, ...]`, and how each was solved; see `stretch`."""
+        stretch = self.stretch(state, controls, steps)
+        return stretch.states, stretch.solution
+
+    def stretch(self, state: S, controls: Tensor | None, steps: int) -> Stretch[S]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero)."""
         state = self.complete(state)
         journey = self._went(state, controls, (steps,))

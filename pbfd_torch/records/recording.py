@@ -118,17 +118,17 @@ def least_bytes(scene: Scene, worlds: int, steps: int) -> int:
 class Recorder(Records):
     """The record of a `Simulator`."""
 
-    def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, state: State) -> None:
+    def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, step_size: Tensor, state: State) -> None:
         super().__init__(scene, dt)
+        self._step_size = step_size.detach()
         self._integrator = integrator
         self._begin(self._state(state, place(scene.articulation, state.q)))
 
     def _state(self, state: State, placement: Placement) -> dict[str, Tensor]:
         scene = self._scene
         a = scene.articulation
-        dt = torch.tensor(self._dt, dtype=a.dtype, device=a.device)
-        v = self._integrator.velocity(a, state, dt)
-        rates = self._integrator.pose_rates(a, state, dt)
+        v = self._integrator.velocity(a, state, self._step_size)
+        rates = self._integrator.pose_rates(a, state, self._step_size)
         return self._seen(placement, v, rates, scene.potential_energy(placement, state.time))
 
     def record(self, state: State, solution: Solution, objective: BalanceObjective) -> None:

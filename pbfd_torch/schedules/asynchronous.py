@@ -193,7 +193,7 @@ class AsynchronousRollout:
             if int(self._made.min()) == 0:
                 raise
         whole = self._whole
-        recorder = Recorder(whole.scene, whole.integrator, whole.dt, self._state_at(0))
+        recorder = Recorder(whole.scene, whole.integrator, whole.dt, whole.step_size, self._state_at(0))
         with torch.no_grad():
             for k in range(int(self._made.min())):
                 objective = whole.objective(self._state_at(k), None if self._control is None else self._controls[k])

@@ -22,7 +22,7 @@ def rolled_out(
 ) -> Rollout:
     """See `Simulator.rollout`."""
     count = stepper.scene.step_count(controls, steps)
-    recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, state)
+    recorder = Recorder(stepper.scene, stepper.integrator, stepper.dt, stepper.step_size, state)
     try:
         for k in range(count):
             before, control = state, None if controls is None else controls[k]

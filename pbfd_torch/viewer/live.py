@@ -112,7 +112,7 @@ class Live(Served):
         return before, solution, way.objective or self._simulator.objective(before, self._control)
 
     def _record(self, before: Any, solution: Any, objective: Any) -> Rollout:
-        recorder = Recorder(self._simulator.scene, self._simulator.integrator, self._dt, before)
+        recorder = Recorder(self._simulator.scene, self._simulator.integrator, self._dt, self._simulator.step_size, before)
         recorder.record(self._state, solution, objective)
         return recorder.finish()
 

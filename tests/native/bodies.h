@@ -1,12 +1,15 @@
 // One free body with points or balls at it above the ground, many worlds of it stepped by the library.
 #pragma once
-#include "library.cpp"
+#include "itinerary.h"
 
 #include <cstdlib>
 #include <limits>
 #include <vector>
 
 #include "check.h"
+#include "given.h"
+
+using namespace pbfd;
 
 namespace bodies {
 

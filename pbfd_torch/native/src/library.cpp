@@ -1,9 +1,8 @@
 // The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
-#include "interface.h"
-
 #include <algorithm>
 
 #include "finding.h"
+#include "given.h"
 #include "inspection.h"
 #include "record.h"
 #include "starts.h"
@@ -19,12 +18,6 @@ const char* pbfd_target() { return target; }
 
 namespace {
 
-Sizes sizes(const pbfd_plan* p) {
-  const CandidateSizes contact{p->candidates, p->anchors, p->planes, p->solids, p->samples, p->forms, p->uncommon};
-  return {contact, p->nodes, p->nq, p->nv, p->nu, p->pushes,
-          {p->links, p->groups, p->rows, p->pairs, p->colliders, p->slots, p->remembered}, p->moving};
-}
-
 template <class T, class A> Timetable<T> timetable(const pbfd_plan* p, const A* asked) {
   return {static_cast<const T*>(asked->poses), asked->timed, p->moving};
 }
@@ -39,11 +32,6 @@ template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, c
 
 Rules rules(const pbfd_steps* s) {
   return {s->tolerance, s->surplus, s->share, s->jump, s->halvings, s->evaluations, s->accuracy, s->shortest};
-}
-
-template <class N, int D> Plan<N, D> plan_of(const pbfd_plan* p, const N* numbers) {
-  using T = typename Kind<N>::Scalar;
-  return {sizes(p), p->whole, numbers, static_cast<const T*>(p->sample), p->body_whole, static_cast<const T*>(p->body_real)};
 }
 
 template <class V> Numbers<V> numbers_of(const pbfd_plan* p, const void* own, int first, int count, Arena<V>& arena) {
