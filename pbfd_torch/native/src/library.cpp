@@ -11,7 +11,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 10; }
+int pbfd_interface() { return 11; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
