@@ -13,6 +13,7 @@ from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Collider, Shape
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
+from pbfd_torch.native.engine import Engine
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
@@ -84,9 +85,10 @@ def rolled_out(
     q: Tensor | None = None,
     v: Tensor | None = None,
     integrator: Integrator[Any] | None = None,
+    engine: Engine | None = None,
 ) -> Rollout:
     """A rollout from the second-order start, without control; by implicit Euler, of which most is known."""
-    simulator: Simulator[Any] = Simulator(scene, dt, integrator or ImplicitEuler())
+    simulator: Simulator[Any] = Simulator(scene, dt, integrator or ImplicitEuler(), engine=engine)
     return simulator.rollout(simulator.initial_state(q, v), steps=math.ceil(duration / dt - 1e-9))
 
 

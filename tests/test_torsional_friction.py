@@ -10,9 +10,11 @@ import torch
 from pbfd_torch.balance.assembly import Balance
 from pbfd_torch.balance.objective import EnergyObjective
 from pbfd_torch.contact.half_space import HalfSpace
-from pbfd_torch.contact.shapes import Collider, Point, Sphere
+from pbfd_torch.contact.shapes import Capsule, Collider, Point, Sphere
 from pbfd_torch.errors import InputError
+from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.scene import Scene
+from pbfd_torch.simulator import Simulator
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -23,9 +25,12 @@ from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import place
 from tests.bodies import GRAVITY, at, diagonal, down, free_body, rolled_out
 from tests.finite_differences import jacobian, relative_error
+from tests.native_parity import DT
 from tests.random_trees import SEEDS
 from tests.states import implicit
 from tests.term_cases import no_load
+from tests.test_native_contact import SOLIDS as UNEVEN
+from tests.test_native_contact import beside, touching
 from tests.test_obstacles import SOLIDS, Meeting, meeting
 
 RADIUS, INERTIA, MU, PATCH = 0.1, 0.004, 0.5, 0.02
@@ -53,7 +58,7 @@ def test_jacobian_is_exact(seed: int, solid: str, spin_speed: float) -> None:
 def test_torque(share: float) -> None:
     """−ℓ μ N (2 − y) y at y = share of ε_ω Δt below 1, −ℓ μ N above, about the normal; no force; nothing without contact."""
     for height, normal in ((RADIUS - 1e-3, 1e6 * 1e-6), (RADIUS + 1e-3, 0.0)):
-        articulation, contact = _ball()
+        articulation, contact = ball()
         term = TorsionalFriction(contact, MU, PATCH, 0.1)
         simulator = implicit(Scene(articulation, (Inertia(), contact, term), down()), 0.01)
         before, after = at(height), at(height, (0.0, 0.0, share * 0.1 * 0.01))
@@ -65,7 +70,7 @@ def test_torque(share: float) -> None:
         torch.testing.assert_close(residual, expected, rtol=1e-9, atol=1e-15)
 
 
-def _ball() -> tuple[Articulation, Contact]:
+def ball() -> tuple[Articulation, Contact]:
     """A ball of 1 kg on the ground, C⊥ = 1e6."""
     articulation = free_body(1.0, diagonal(INERTIA, INERTIA, INERTIA))
     colliders = [Collider("ball", "body", Sphere(RADIUS))]
@@ -74,13 +79,18 @@ def _ball() -> tuple[Articulation, Contact]:
 
 @pytest.mark.parametrize("dt", [0.005, 0.02])
 def test_spinning_ball_stops(dt: float) -> None:
+    """In PyTorch; by the compiled core in `test_native_torsion`."""
+    require_stop(dt, Torch())
+
+
+def require_stop(dt: float, engine: Engine) -> None:
     """ω_0 = 2 rad/s about the vertical ends after ω_0 I/(ℓ μ m g), to 1 % and two steps, on the spot. On the way the scheme's own
     law I (2 sin Δ' − sin(Δ' + Δ))/Δt² = −ℓ μ m g holds to 1e-6, Δ the turn per step. Without the friction it spins on."""
-    articulation, contact = _ball()
+    articulation, contact = ball()
     q = at(RADIUS - (GRAVITY / 1e6) ** 0.5)
     v = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 2.0], dtype=torch.float64)
     terms = (Inertia(), contact, TorsionalFriction(contact, MU, 0.2 * PATCH))
-    rollout = rolled_out(Scene(articulation, terms, down()), dt, 0.8, q, v)
+    rollout = rolled_out(Scene(articulation, terms, down()), dt, 0.8, q, v, engine=engine)
     assert bool(rollout.solved.all())
     brake = 0.2 * PATCH * MU * GRAVITY
     exact = 2.0 * INERTIA / brake
@@ -91,8 +101,26 @@ def test_spinning_ball_stops(dt: float) -> None:
     turned = spin[1:][spin[1:] > 0.05] * dt
     law = INERTIA * (2 * torch.sin(turned[1:]) - torch.sin(turned[1:] + turned[:-1])) / dt**2
     torch.testing.assert_close(law, torch.full_like(law, -brake), rtol=1e-6, atol=0)
-    free = rolled_out(Scene(articulation, terms[:2], down()), 0.02, 0.5, q, v)
+    free = rolled_out(Scene(articulation, terms[:2], down()), 0.02, 0.5, q, v, engine=engine)
     assert float(free.v[-1, 5]) > 1.85
+
+
+@pytest.mark.parametrize("solid", ["terrain", "grid"])
+def test_jacobian_is_exact_where_distances_are_not(solid: str) -> None:
+    """J = ∂r/∂θ on solids whose depths grow by less or more than what sinks, ≤ 1e-9 relative."""
+    scene = touching((Sphere(0.05), Capsule(0.03, 0.1)), (UNEVEN[solid],))
+    state, q = beside(scene, 12)
+    contact, step = scene.terms[1], Simulator(scene, DT).objective(state).step
+    assert isinstance(contact, Contact)
+    term = TorsionalFriction(contact, 0.7, 0.05, 100.0)
+    assert contact.touching(term.prepare(step), place(scene.articulation, q)).steepness is not None
+
+    def here(q: torch.Tensor) -> Balance:
+        placement = place(scene.articulation, q)
+        return Balance(placement, [no_load(placement), term.load(term.prepare(step), placement)])
+
+    expected = jacobian(scene.articulation, lambda q: here(q).residual, q, 1e-4)
+    assert relative_error(here(q).jacobian, expected, floor=1e-3 * here(q).residual.abs().amax(-1)) <= 1e-9
 
 
 def test_worlds_are_apart_and_lagged_friction_has_an_energy() -> None:
@@ -108,7 +136,7 @@ def test_worlds_are_apart_and_lagged_friction_has_an_energy() -> None:
     torch.testing.assert_close(part.residual, whole.residual[[2, 0]], rtol=0, atol=1e-13 * float(whole.residual.abs().max()))
     torch.testing.assert_close(part.jacobian, whole.jacobian[[2, 0]], rtol=0, atol=1e-13 * float(whole.jacobian.abs().max()))
 
-    articulation, contact = _ball()
+    articulation, contact = ball()
     scene = Scene(articulation, (Inertia(), contact, TorsionalFriction(contact, MU, PATCH)), down())
     simulator = implicit(scene, 0.01)
     q = at(RADIUS - 1e-3, (0.0, 0.0, 0.01))
@@ -125,7 +153,7 @@ def test_worlds_are_apart_and_lagged_friction_has_an_energy() -> None:
 
 def test_points_have_no_patch() -> None:
     """A contact of points alone is refused, and so are a negative patch and no spin speed."""
-    articulation, contact = _ball()
+    articulation, contact = ball()
     points = Contact.between(articulation, [Collider("point", "body", Point())], HalfSpace(), NormalForce(1e6))
     with pytest.raises(InputError, match="radius"):
         TorsionalFriction(points, MU, PATCH)

@@ -18,6 +18,7 @@ from pbfd_torch.native.four_poses import Seats
 from pbfd_torch.native.not_compiled import unknown
 from pbfd_torch.native.plan_bodies import Bodies
 from pbfd_torch.native.plan_contact import Candidates, joined, on_nodes
+from pbfd_torch.native.plan_torsion import torsions
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
@@ -32,11 +33,13 @@ from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import HELD, JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings
 from pbfd_torch.terms.pushes import Pushes
+from pbfd_torch.terms.torsional_friction import TorsionalFriction
 from pbfd_torch.tree.articulation import Articulation, JointKind, force_scale, reach
 
 KINDS = {(1, 1): 0, JointKind.BALL.value[:2]: 2, JointKind.FREE.value[:2]: 3}  # slides are 1, as src/plan.h has them
 CONTACTS = (Contact, CurvedContact, BodyContact, CurvedBodyContact)
-TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, Pushes, *CONTACTS)
+SEVERAL = (*CONTACTS, TorsionalFriction, Pushes)  # of which a scene may have more than one
+TERMS = (Inertia, JointSprings, JointDamping, Armature, JointDryFriction, JointLimits, Actuators, *SEVERAL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,13 +280,14 @@ class _Terms:
         self.pushes: list[tuple[Tensor, Tensor]] = []  # points and forces
         self.carriers = Carriers()
         self.candidates = Candidates(self.carriers)
+        self.torsions = torsions(stepper.scene.terms)
         self.meetings: list[BodyContact] = []
         seen: set[type] = set()
         for term in stepper.scene.terms:  # the core fits them itself
             kind = type(term)
             if kind not in TERMS:
                 raise unknown(kind.__name__)
-            if kind in seen and kind not in (*CONTACTS, Pushes):
+            if kind in seen and kind not in SEVERAL:
                 raise unknown(f"two terms {kind.__name__}")
             seen.add(kind)
             self._take(a, term)
@@ -306,7 +310,7 @@ class _Terms:
             case Actuators():
                 self.actuators = term
             case Contact():
-                self.candidates.take(a, term)
+                self.candidates.take(a, term, self.torsions.pop(id(term), None))
             case BodyContact():
                 self.meetings.append(term)
                 self.candidates.taken += term.finder.slots

@@ -20,6 +20,7 @@ from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
+from pbfd_torch.terms.torsional_friction import TorsionalFriction
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What touches what, as `each_kind` in src/kinds.h has it: candidates are sorted by these.
@@ -127,8 +128,8 @@ class Candidates:
         tables = (list(chain(*self.rows)), [[x] for x in self.planes], self.solids, self.forms)
         return [x for table in tables for column in zip(*table, strict=True) for x in column]
 
-    def take(self, a: Articulation, term: Contact) -> None:
-        """Adds the candidates of a contact. Raises `NotCompiledError`."""
+    def take(self, a: Articulation, term: Contact, torsion: TorsionalFriction | None) -> None:
+        """Adds the candidates of a contact, which may have torsional friction. Raises `NotCompiledError`."""
         name = term.pairs[0][1] if term.pairs else "the ground"
         anchored = isinstance(term.friction, AnchoredFriction)
         nodes = [a.topology.link_node[link] for link in term.link.tolist()]
@@ -136,7 +137,7 @@ class Candidates:
         if len(moving) < len(nodes) and _runs(term):
             raise unknown(f"what does not move against '{name}', which does")
 
-        law = Law.of(a, term, f"'{name}'", len(nodes))
+        law = Law.of(a, term, f"'{name}'", len(nodes), torsion)
         numbers = (term.radius, term.margin, *law.numbers)
         anchor = sum(self.anchors)
         self.anchors.append(len(nodes) if anchored else 0)

@@ -18,16 +18,18 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pbd_friction import PbdFriction
 from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.static_friction import StaticFriction
+from pbfd_torch.terms.torsional_friction import TorsionalFriction
 from pbfd_torch.tree.articulation import Articulation
 
 COULOMB, STATIC, PAPER, GRADIENT = range(4)  # anchored friction is Coulomb's with a memory
+PATCH = 7  # which of the particulars ℓμ is
 USUAL = -1  # the law C d² with Coulomb's friction, of which most contacts are: it has no row
 
 
 @dataclass
 class Laws:
     """The other ones, of a candidate or of a pair each: its manner, and α, e, γ, μ_s − μ_k, 1/v_s [s/m], the restitution (0: none)
-    and its threshold [m/s], `[*, 1]` each."""
+    and its threshold [m/s], ℓμ of torsional friction [m] (0: none) and 1/ε_ω [s/rad], `[*, 1]` each."""
 
     manners: list[int] = field(default_factory=list)
     rows: list[Sequence[Tensor]] = field(default_factory=list)
@@ -38,10 +40,11 @@ class Laws:
 
     def number(self, law: Law, i: int) -> int:
         """Adds that of one of the candidates or pairs of a contact; its number."""
-        if law.usual:
+        row = [x[..., i, None] for x in law.particulars]
+        if law.usual and not bool((row[PATCH] > 0).any()):
             return USUAL
         self.manners.append(law.manner)
-        self.rows.append([x[..., i, None] for x in law.particulars])
+        self.rows.append(row)
         return len(self.manners) - 1
 
 
@@ -50,7 +53,8 @@ class Law:
     """That of a contact of n candidates or pairs.
 
     Attributes:
-        manner: of its friction. particulars: `[*, n]` each, see `Laws`. usual: whether nothing is particular about it.
+        manner: of its friction. particulars: `[*, n]` each, see `Laws`. usual: whether nothing is particular about it but torsional
+            friction.
         numbers: C⊥, μ or what friction that goes by the depth has in its place, from which depth on it is a hazard [m], one over
             the release speed [s/m] and one over what friction is smooth below, a slip speed [s/m] or the stretch of an anchor
             [1/m], `[*, n]` each.
@@ -62,8 +66,8 @@ class Law:
     numbers: Sequence[Tensor]
 
     @classmethod
-    def of(cls, a: Articulation, term: ContactLaws[Any], name: str, count: int) -> Law:
-        """Of a term. Raises `NotCompiledError` for laws that the core does not know."""
+    def of(cls, a: Articulation, term: ContactLaws[Any], name: str, count: int, torsion: TorsionalFriction | None = None) -> Law:
+        """Of a term, and of its torsional friction. Raises `NotCompiledError` for laws that the core does not know."""
         law, firm, back = term.normal_force, term.firm, term.restitution
         if type(law) is not NormalForce:
             raise unknown(f"normal force on {name}, a {type(law).__name__}")
@@ -90,6 +94,8 @@ class Law:
             each(friction.per_fall),
             each(0.0 if back is None else back.coefficient),
             each(0.0 if back is None else back.threshold),
+            each(None if torsion is None else torsion.arm),
+            each(1.0 if torsion is None else 1.0 / torsion.spin_speed),
         )
         usual = friction.manner == COULOMB and law.exponent == 2.0 and back is None
         return cls(friction.manner, particulars, usual, numbers)

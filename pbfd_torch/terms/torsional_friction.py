@@ -49,7 +49,7 @@ class TorsionalFriction:
             raise InputError("no candidate of the contact has a radius: torsional friction needs a sphere or a capsule")
 
     @cached_property
-    def _arm(self) -> Tensor:
+    def arm(self) -> Tensor:
         """ℓ μ of the rounded candidates, 0 for points, `[*, npoint]` [m]."""
         return self.mu * self.patch * (self.contact.radius > 0).to(self.contact.radius.dtype)
 
@@ -74,7 +74,7 @@ class TorsionalFriction:
             push, slope = self.held, torch.zeros_like(slope)
         turn = force.at.turn
         assert turn is not None  # the contact is rounded
-        return force.at, turn, self._arm * push, self._arm * slope, dot(turn, force.at.normal)
+        return force.at, turn, self.arm * push, self.arm * slope, dot(turn, force.at.normal)
 
     def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         at, turn, limit, by_depth, angle = self._at(prepared, placement)
@@ -91,7 +91,7 @@ class TorsionalFriction:
             if at.bend is not None:
                 spin = spin + rows(turn, at.bend() @ shift)
             rises = limit * (factor + size * slip_factor_slope(size, width))
-            grows = rises[..., None] * spin - (by_depth * factor * angle)[..., None] * rows(at.normal, shift)
+            grows = rises[..., None] * spin - (by_depth * factor * angle)[..., None] * at.sinks
             answer = outer(at.normal, grows)
             if at.bend is not None:
                 answer = answer + (limit * factor * angle)[..., None, None] * (at.bend() @ shift)

@@ -1,5 +1,5 @@
-// Every kind of contact: J is the derivative of r, what a direction promises sets out along r·d and dᵀJd, and a world gets the same
-// numbers in a register of worlds and by itself.
+// Every kind of contact: J is the derivative of r, friction that is held at the forces of a place is there what it was, what a
+// direction promises sets out along r·d and dᵀJd, and a world gets the same numbers in a register of worlds and by itself.
 #include "outlook.h"
 
 #include <cmath>
@@ -15,7 +15,7 @@ namespace {
 constexpr double DT = 0.01, MASS = 1.0, SECOND = 0.01, INF = std::numeric_limits<double>::infinity();
 constexpr int NQ = 7, NV = 6, WORLDS = 11, KINDS = Candidates<double, 3>::KINDS, CELLS = 9;
 
-// The usual law, anchors, and all uncommon manners, some with another exponent.
+// The usual law, anchors, and all uncommon manners, some with another exponent; torsional friction with some, sticking and sliding.
 struct Holding {
   bool anchored, uncommon;
   int manner;
@@ -29,7 +29,11 @@ const Holding HOLDINGS[] = {{false, false, 0, 0.5, {}},
                             {false, true, PAPER, 1e6, {2, 1, 1, 0, 0}},
                             {false, true, PAPER, 3e6, {1.7, 0.6, 1.3, 0, 0}},
                             {false, true, GRADIENT, 1e5, {2, 0, 1, 0, 0}},
-                            {false, true, GRADIENT, 1e6, {2, 0.5, 1.4, 0, 0}}};
+                            {false, true, GRADIENT, 1e6, {2, 0.5, 1.4, 0, 0}},
+                            {false, true, COULOMB, 0.5, {2, 0, 0, 0, 0, 0, 0, 0.05, 1 / 0.5}},
+                            {true, true, COULOMB, 0.5, {2, 0, 0, 0, 0, 0, 0, 0.05, 1 / 0.05}},
+                            {false, true, PAPER, 1e6, {2, 1, 1, 0, 0, 0, 0, 0.05, 1 / 0.5}},
+                            {false, true, GRADIENT, 1e6, {1.7, 0.5, 1.4, 0, 0, 0, 0, 0.05, 1 / 0.05}}};
 
 // A free body at z = 1.2 or so that touches a solid whose top is at z = 1, by a candidate of one kind.
 struct Scene {
@@ -99,6 +103,33 @@ void start(double* q, int world, double height) {
   quaternion_exp(turn, q + 3);
 }
 
+// J at q, where `b` has been evaluated, is how r differs at the places beside it.
+void derive(const Balance<double, double>& b, Balance<double, double>& moved, const double* q) {
+  double largest = 1, d[NV], shifted[NQ], off[NV][NV];  // differences of r less J
+  for (int i = 0; i < NV * NV; i++) largest = std::fmax(largest, std::fabs(b.matrix[i]));
+  for (int j = 0; j < NV; j++) {
+    double column[2][NV];
+    for (int side = 0; side < 2; side++) {
+      for (int i = 0; i < NV; i++) d[i] = i == j ? (side ? 1e-6 : -1e-6) : 0;
+      retract(b.plan, q, d, 1.0, shifted);
+      moved.evaluate(shifted);
+      for (int i = 0; i < NV; i++) column[side][i] = moved.residual[i];
+    }
+    for (int i = 0; i < NV; i++) off[i][j] = (column[1][i] - column[0][i]) / 2e-6 - b.matrix[NV * i + j];
+  }
+  for (int i = 0; i < NV; i++)
+    for (int j = 0; j < NV; j++) {
+      const bool turns = i >= 3 && j >= 3;  // torques along axes that turn themselves: J is that of a chart which does not
+      CHECK(std::fabs(turns ? 0.5 * (off[i][j] + off[j][i]) : off[i][j]) < 1e-6 * largest);
+    }
+}
+
+// Friction from here on feels the forces where `b` is.
+void hold(Balance<double, double>& b, const Balance<double, double>& at) {
+  b.relaxed.lagged = b.relaxed.lagging = true;
+  at.each_normal_force(at.now, [&](int i, double force, double felt) { b.relaxed.hold(true, i, force, felt); });
+}
+
 void of_kind(int kind, const Holding& how) {
   const Scene scene(kind, how);
   const Plan<double> plan(scene.sizes, scene.whole.data(), scene.real.data(), scene.heights.data());
@@ -120,29 +151,14 @@ void of_kind(int kind, const Holding& how) {
   const V behind_all[3] = {V(behind[0]), V(behind[1]), V(behind[2])};
   b.contacts.behind = moved.contacts.behind = behind, all.contacts.behind = behind_all;
   for (int world = 0; world < WORLDS; world++) {
-    double q[NQ], d[NV], shifted[NQ];
+    double q[NQ], d[NV];
+    b.relaxed.none(), moved.relaxed.none();
     start(q, world, height);
     begin(b, q, v, room), begin(moved, q, v, room);
     b.evaluate(q), b.assemble(q, true);
     touched += b.pushes[0].any;
-    double largest = 1, work = 0, curve = 0, known;
-    for (int i = 0; i < NV * NV; i++) largest = std::fmax(largest, std::fabs(b.matrix[i]));
-    double off[NV][NV];  // differences of r less J
-    for (int j = 0; j < NV; j++) {
-      double column[2][NV];
-      for (int side = 0; side < 2; side++) {
-        for (int i = 0; i < NV; i++) d[i] = i == j ? (side ? 1e-6 : -1e-6) : 0;
-        retract(plan, q, d, 1.0, shifted);
-        moved.evaluate(shifted);
-        for (int i = 0; i < NV; i++) column[side][i] = moved.residual[i];
-      }
-      for (int i = 0; i < NV; i++) off[i][j] = (column[1][i] - column[0][i]) / 2e-6 - b.matrix[NV * i + j];
-    }
-    for (int i = 0; i < NV; i++)
-      for (int j = 0; j < NV; j++) {
-        const bool turns = i >= 3 && j >= 3;  // torques along axes that turn themselves: J is that of a chart which does not
-        CHECK(std::fabs(turns ? 0.5 * (off[i][j] + off[j][i]) : off[i][j]) < 1e-6 * largest);
-      }
+    derive(b, moved, q);
+    double work = 0, curve = 0, known;
     for (int i = 0; i < NV; i++) d[i] = 0.01 * std::cos(2.0 * i + world), work += b.residual[i] * d[i];
     for (int i = 0; i < NV; i++)
       for (int j = 0; j < NV; j++) curve += d[i] * b.matrix[NV * i + j] * d[j];
@@ -165,6 +181,13 @@ void of_kind(int kind, const Holding& how) {
     all.evaluate(q_all), all.assemble(q_all, true);
     for (int i = 0; i < NV; i++) CHECK(lane(all.residual[i], 0) == b.residual[i]);
     for (int i = 0; i < NV * NV; i++) CHECK(lane(all.matrix[i], 0) == b.matrix[i]);
+
+    double residual[NV], size = 0;
+    for (int i = 0; i < NV; i++) residual[i] = b.residual[i], size = std::fmax(size, std::fabs(residual[i]));
+    hold(moved, b), hold(b, b);
+    b.evaluate(q), b.assemble(q, true);
+    for (int i = 0; i < NV; i++) CHECK(std::fabs(b.residual[i] - residual[i]) <= 1e-12 * size);
+    derive(b, moved, q);
   }
   CHECK(touched == WORLDS);
 }

@@ -41,7 +41,7 @@ template <class V, class N, int D = 3> struct Balance {
     return s.nodes * (3 * (D * D + D) + 2 * D) + in_registers<Hold<V, D>>(s.nodes) + in_registers<Pull<V, D>>(s.nodes) +
            in_registers<Push<V, D>>(s.nodes) + Laws<V, N, D>::room(s) + Contacts<V, N, D>::room(s) +
            Meetings<V, N, D>::room(s) + 2 * s.nq + s.nu +
-           (3 * S + 4 + s.nv) * s.nv + held(s) + Carriers<V>::room(s);
+           (3 * S + 4 + s.nv) * s.nv + 2 * held(s) + Carriers<V>::room(s);
   }
   static int held(Sizes s) { return s.candidates + SPOTS * s.bodies.rows; }
   template <class X> static X* taken(Arena<V>& arena, int count) {
@@ -56,7 +56,7 @@ template <class V, class N, int D = 3> struct Balance {
     start.carriers = carriers.start, target.carriers = now.carriers = carriers.end;
     start_axes = arena.take(S * plan.nv), axes = arena.take(S * plan.nv), chord_axes = arena.take(S * plan.nv);
     q_start = arena.take(plan.nq), q_target = arena.take(plan.nq), control = arena.take(plan.nu);
-    fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan));
+    fitted = arena.take(plan.nv), relaxed.held = arena.take(held(plan)), relaxed.pressed = arena.take(held(plan));
     relaxed.none();
     limits = arena.take(plan.nv), arms = arena.take(D * plan.nodes), chord = arena.take(D * plan.nodes);
     residual = arena.take(plan.nv), slopes = arena.take(plan.nv), matrix = arena.take(plan.nv * plan.nv);
@@ -99,7 +99,7 @@ template <class V, class N, int D = 3> struct Balance {
     add_pushed(residual);
   }
 
-  // What contacts and forces from outside do where the nodes are.
+  // What contacts, torsional friction and forces from outside do where the nodes are.
   void press() {
     gather([&] { touch(), push(); });
   }
@@ -114,9 +114,11 @@ template <class V, class N, int D = 3> struct Balance {
     contacts.look(now), contacts.press(pushes);
     meetings.look(now), meetings.press(pushes);
   }
+  // What does not set in abruptly; contacts have looked.
   void push() {
-    if constexpr (D == 3) push_from_outside(plan, now, pushes);
+    if constexpr (D == 3) push_from_outside(plan, now, pushes), contacts.resist_spins(pushes);
   }
+  bool pushed() const { return D == 3 && (plan.pushes > 0 || laws.torsional); }
   // Adds the residual of what has been gathered.
   void add_pushed(V* out) const {
     for (int k = 0; k < plan.nodes; k++)

@@ -3,7 +3,7 @@
 #pragma once
 #include "carriers.h"
 #include "kinds.h"
-#include "touching.h"
+#include "torsion.h"
 
 namespace pbfd {
 
@@ -105,6 +105,26 @@ template <class V, class N, int D> struct Contacts {
         pbfd::press<Surface::flat, Support>(t, pushes[candidates.carrier[i]]);
       }
     });
+  }
+
+  // Adds the torques of torsional friction, a term of its own: it does not set in abruptly, as contacts do.
+  [[gnu::noinline]] void resist_spins(Push<V, D>* pushes) {
+    if constexpr (D == 3)
+      if (laws.torsional) each_kind(candidates, [&](auto pair, int first, int last) {
+        using Support = typename decltype(pair)::Support;
+        if constexpr (Support::rolls && !Support::wanders)
+          for (int i = first; i < last; i++) {
+            const Law<V>* law = laws.at(candidates.law[i]);
+            if (!law || !law->torsional()) continue;
+            Touching<V, D> t;
+            center(i, now, t.center);
+            t.depth = depth(pair, i, now, t.center, t.solid) + moved_out(i);
+            const V pressed = relaxed.pressing(i);
+            if (!any((t.depth > V(0)) | (pressed > V(0)))) continue;
+            touch(pair, i, t);
+            resist_spin<decltype(pair)::Surface::flat>(t, pressed, pushes[candidates.carrier[i]]);
+          }
+      });
   }
 
   // What the anchors are behind by after a step of the step's own problem that ended where the nodes are now: w, cut to the stretch;

@@ -27,7 +27,9 @@ template <class V> struct Law {
   T exponent, slip, sunk;  // α; e and γ of G = μ yᵉ d^(γ+1)
   V excess, per_fall;      // μ_s − μ_k, and 1 / (v_s Δt)
   T restitution, threshold;
+  V patch, per_turn;  // ℓμ, and 1 / (ε_ω Δt)
 
+  bool torsional() const { return any(patch > V(0)); }
   bool throws() const { return restitution > T(0); }
   // How far the solid is moved out for a step Δt, by the gaps at its start and at the ends of its free motion and of that without
   // gravity; 0 where nothing bounces (terms/restitution.py).
@@ -114,7 +116,7 @@ template <class V, class N, int D> struct Laws {
   const Plan<N, D>& plan;
   const Relaxed<V>& relaxed;
   Law<V>* law;  // [uncommon]
-  bool throwing = false;  // some of them
+  bool throwing = false, torsional = false;  // some of them
   Poses<V> coasting;      // where the nodes would end the step without gravity
 
   static int listed(Sizes s) { return int((s.uncommon * sizeof(Law<V>) + sizeof(V) - 1) / sizeof(V)); }
@@ -126,13 +128,14 @@ template <class V, class N, int D> struct Laws {
 
   // A step begins.
   void begin(V dt) {
-    throwing = false;
+    throwing = torsional = false;
     const N* x = plan.particulars;
     for (int j = 0; j < plan.uncommon; j++, x += PARTICULARS) {
       Law<V>& l = law[j];
       l.manner = plan.manner[j], l.exponent = lane(x[0], 0), l.slip = lane(x[1], 0), l.sunk = lane(x[2], 0);
       l.excess = V(x[3]), l.per_fall = V(x[4]) / (dt * relaxed.width);
       l.restitution = lane(x[5], 0), l.threshold = lane(x[6], 0), throwing = throwing || l.throws();
+      l.patch = V(x[7]), l.per_turn = V(x[8]) / (dt * relaxed.width), torsional = torsional || l.torsional();
     }
   }
   // It would lead to `free` without contacts.

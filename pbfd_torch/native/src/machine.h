@@ -190,7 +190,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void hold(M which) {
     Balance<V, N, D>& b = newton.balance;
     sight.look(from);
-    b.each_normal_force(sight.there, [&](int i, V, V felt) { b.relaxed.held[i] = select(which, felt, b.relaxed.held[i]); });
+    b.each_normal_force(sight.there, [&](int i, V force, V felt) { b.relaxed.hold(which, i, force, felt); });
   }
 
   // Lanes whose solve has ended take the next detour, or their attempt has ended; who sets out now.

@@ -137,7 +137,7 @@ template <class V, class N, int D = 3> struct Newton {
   M absurd() {
     V* driven = column;
     forces_of<SMOOTH | DRY>(balance, trial, driven, step);
-    if (plan.pushes > 0) {
+    if (balance.pushed()) {
       balance.gather([&] { balance.push(); }), balance.add_pushed(driven);
       balance.press();
     }

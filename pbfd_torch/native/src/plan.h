@@ -13,7 +13,9 @@ inline int coordinates(int kind) { return kind == FREE ? 7 : kind == BALL ? 4 : 
 inline int freedoms(int kind) { return kind == FREE ? 6 : kind == BALL ? 3 : 1; }
 inline int straight(int kind) { return kind == FREE ? 3 : kind == SLIDE ? 1 : 0; }  // of these, the first
 
-constexpr int PARTICULARS = 7;  // of a law: α, e, γ, μ_s − μ_k, 1/v_s [s/m]; restitution (0: none), and its threshold [m/s]
+// Of a law: α, e, γ, μ_s − μ_k, 1/v_s [s/m]; restitution (0: none), and its threshold [m/s]; of torsional friction ℓμ [m] (0: none)
+// and 1/ε_ω [s/rad].
+constexpr int PARTICULARS = 9;
 
 struct Sizes : CandidateSizes {
   int nodes, nq, nv, nu, pushes;
