@@ -243,11 +243,14 @@ class AdaptiveSimulator(Simulator[S]):
 
     def _stepping(self) -> tuple[Stepper[S], str, str]:
         if self._made is None:
-            fixed, *known = super()._stepping()
-            # where obstacles are is asked for at each step's own times
-            whole = isinstance(fixed, NativeStepper) and not fixed.moving
-            self._made = (fixed.framed(self._accuracy) if whole else AdaptiveStepper(fixed, self._accuracy), *known)
+            fixed, name, reason = super()._stepping()
+            self._made = self._framed(fixed), name, reason
         return self._made
+
+    def _framed(self, fixed: Stepper[S]) -> Stepper[S]:
+        if isinstance(fixed, NativeStepper) and not fixed.moving:
+            return fixed.framed(self._accuracy)
+        return AdaptiveStepper(fixed, self._accuracy)  # where obstacles are is asked for at each step's own times
 
     def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step`. Raises `InputError` where something carries derivatives: which steps are taken depends on it, but

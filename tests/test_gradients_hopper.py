@@ -109,6 +109,6 @@ def alive(state: State) -> tuple[State, list[Tensor]]:
 
 def retraced(simulator: Simulator[Any], state: State, control: Tensor, made: Made) -> Any:
     """The end of a step that is known, as a function of its state and control."""
-    play = Step(Linked(simulator.eager, simulator.gradients), state, control)
+    play = Step(Linked(simulator.eager, simulator.gradients, lambda eager: eager), state, control)
     play.made = made
     return play.again(simulator.eager, state, control)

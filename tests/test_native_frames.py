@@ -31,7 +31,8 @@ def test_frames_are_the_references(name: str, scheme: Integrator[Any]) -> None:
     setup = SCENES[name](worlds=2)
     controls = setup.controls(4)
     ours, theirs = (
-        AdaptiveSimulator(setup.scene, FRAME, ACCURACY, scheme, shortest=FRAME / 64, engine=engine) for engine in (Native(), Torch())
+        AdaptiveSimulator(setup.scene, FRAME, ACCURACY, scheme, shortest=FRAME / 64, engine=engine)
+        for engine in (Native(), Torch())
     )
     assert isinstance(ours.stepper, NativeStepper)
     assert isinstance(theirs.stepper, AdaptiveStepper)

@@ -21,9 +21,9 @@ from pbfd_torch.cli.outputs import check_file
 from pbfd_torch.contact.hazards import Hazard
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import Setup
+from pbfd_torch.native.engine import Torch
 from pbfd_torch.records.recording import least_bytes
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.native.engine import Torch
 from pbfd_torch.schedules.asynchronous import AsynchronousRollout
 from pbfd_torch.schedules.workers import Workers
 from pbfd_torch.solvers.objective import Status

@@ -65,6 +65,7 @@ class Linked(Generic[S]):
         self.leaves = tensors_of(self.parts)
         self.active = [k for k, x in enumerate(self.leaves) if carries(x) or wrapped(x)]
         self._plain: EagerStepper[S] | None = None
+        self._wrapped = False  # torch.func is at work on what it is made of
         self._maker: Stepper[S] | None = None
 
     def carry(self, *values: Any) -> bool:
@@ -75,11 +76,12 @@ class Linked(Generic[S]):
         """The stepper without derivatives, from plain values of the active tensors."""
         if self._plain is None:
             self._plain = self.with_values(values) if self.active else self.stepper
+            self._wrapped = any(map(wrapped, values))
         return self._plain
 
     def maker(self, stepper: EagerStepper[Any], start: Any) -> Stepper[Any]:
         """What makes the steps of a stepper without derivatives from such a start."""
-        if any(map(wrapped, tensors_of([start, *self.leaves]))):
+        if self._wrapped or any(map(wrapped, tensors_of(start))):
             return stepper  # PyTorch alone looks into the tensors of torch.func
         if stepper is not self._plain:
             return self.engine(stepper)
@@ -170,6 +172,7 @@ class Step(Play[S]):
 
     def first(self, stepper: EagerStepper[S], start: S, control: Tensor | None) -> S:
         end, solution, way = self.linked.maker(stepper, start).made(start, control)
+        end = mapped_tensors(end, lambda x: x.clone() if x._is_view() else x)  # see `_Start`
         self.made = Made(solution, way.kept(), doubts_of(solution.status), [] if self.linked.gradients.keep_factors else None)
         return end
 
