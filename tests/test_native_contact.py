@@ -18,6 +18,7 @@ from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.height_field import HeightField
 from pbfd_torch.contact.obstacle import Obstacle
+from pbfd_torch.contact.primitives import SphereSurface
 from pbfd_torch.contact.shapes import Box, Capsule, Collider, ConvexHull, Cylinder, Ellipsoid, Point, Shape, Sphere
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.native.library import library
@@ -130,11 +131,23 @@ def test_friction_of_each_world() -> None:
     require_starts(scene, state.q, state.v)
 
 
+class OwnSurface(SphereSurface):
+    """A user's own."""
+
+
+@dataclass(frozen=True)
+class Own:
+    """A solid of it."""
+
+    def surface(self, dtype: torch.dtype, device: torch.device) -> OwnSurface:
+        return OwnSurface(torch.tensor([0.1], dtype=dtype, device=device))
+
+
 @pytest.mark.parametrize(
     ("law", "solid", "words"),
     [
         (NormalForce(1e5).seen_from(1e-3), GROUND, "normal force on 'ground', a DistantForce"),
-        (NormalForce(1e5), Obstacle("hull", ConvexHull(np.eye(4, 3))), "contact with 'hull', which is a ConvexSurface"),
+        (NormalForce(1e5), Obstacle("own", Own()), "contact with 'own', which is a OwnSurface"),
     ],
 )
 def test_what_is_not_covered_is_said(law: NormalForce, solid: Solid, words: str) -> None:
@@ -155,11 +168,13 @@ class Bubble:
 
 TILTED = ((0.1, -0.2, 0.3), (0.8, 0.3, -0.4, 0.2))
 HILLS = HeightField.from_function(lambda x, y: 0.1 * np.sin(5 * x) * np.cos(4 * y), (1.0, 0.8), 0.1)
+ROCK = np.random.default_rng(3).uniform(-0.2, 0.2, (14, 3))
 CONVEX = {
     "sphere": Obstacle("ball", Sphere(0.2), *TILTED),
     "capsule": Obstacle("pill", Capsule(0.1, 0.2), *TILTED),
     "box": Obstacle("block", Box((0.2, 0.15, 0.1)), *TILTED),
     "cylinder": Obstacle("drum", Cylinder(0.2, 0.1), *TILTED),
+    "hull": Obstacle("rock", ConvexHull(ROCK), *TILTED),
 }
 SOLIDS = CONVEX | {"terrain": Obstacle("terrain", HILLS, *TILTED), "grid": Obstacle("bubble", Bubble(), *TILTED)}
 BALLS, CURVED = (Point(), Sphere(0.05), Sphere(0.02)), (Ellipsoid((0.08, 0.05, 0.03)), Cylinder(0.06, 0.04))
@@ -216,6 +231,7 @@ def free_body(shape: Shape, solid: Solid, kind: Any = Contact) -> Scene:
     return Scene(a, (Inertia(), contact), torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
 
 
+CORNERS = np.array([(x, y, z) for x in (-0.2, 0.2) for y in (-0.15, 0.15) for z in (-0.1, 0.1)])
 NEAR = (-1e-6, -1e-9, -1e-13, 0.0, 1e-13, 1e-9, 1e-6)
 
 
@@ -230,6 +246,7 @@ NEAR = (-1e-6, -1e-9, -1e-13, 0.0, 1e-13, 1e-9, 1e-6)
             [(0.2, 0.0, 0.14), (0.0, 0.2, 0.14), (0.0, 0.0, 0.14), (-0.24, 0.0, 0.1)],
         ),
         (Sphere(0.05), Obstacle("o", Capsule(0.1, 0.2)), [(0.0, 0.14, 0.2), (0.14, 0.0, -0.2), (0.0, 0.0, 0.34)]),
+        (Sphere(0.05), Obstacle("o", ConvexHull(CORNERS)), [(0.2, 0.15, 0.14), (0.2, 0.0, 0.14), (0.2, 0.15, 0.1)]),
         (Sphere(0.05), Obstacle("o", HILLS), [(0.1, 0.0, 0.08), (0.0, -0.4, 0.04), (-0.5, 0.4, 0.04), (0.7, 0.6, 0.04)]),
         (Sphere(0.05), Obstacle("o", Bubble()), [(0.0, 0.0, 0.24), (0.15, 0.1, 0.15)]),
     ],

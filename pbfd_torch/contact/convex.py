@@ -77,7 +77,8 @@ class ConvexSurface:
         return ConvexSurface(*(torch.tensor(x, dtype=dtype, device=device) for x in (normals, offsets, starts, ends)))
 
     @cached_property
-    def _size(self) -> Tensor:
+    def size(self) -> Tensor:
+        """The largest coordinate of a corner [m]."""
         return self.starts.abs().max()
 
     def field(self, points: Tensor) -> Field:
@@ -89,7 +90,7 @@ class ConvexSurface:
         height = dot_of_rows(points, face) - self.offsets[highest]
         foot = (points - height[..., None] * face).detach()[..., None, :]
         overhang = (dot_of_rows(foot, self.normals) - self.offsets).amax(-1)
-        rounding = 8 * torch.finfo(points.dtype).eps * (self._size + height.detach().abs())
+        rounding = 8 * torch.finfo(points.dtype).eps * (self.size + height.detach().abs())
 
         offsets, _, _ = from_segment(place, self.starts, self.ends)
         nearest = dot_of_rows(offsets, offsets).argmin(-1)

@@ -9,6 +9,7 @@ from itertools import chain
 import torch
 from torch import Tensor
 
+from pbfd_torch.contact.convex import ConvexSurface
 from pbfd_torch.contact.distance_grid import DistanceGrid
 from pbfd_torch.contact.height_field import HeightSurface
 from pbfd_torch.contact.primitives import BoxSurface, CylinderSurface, SegmentSurface, SphereSurface
@@ -24,7 +25,8 @@ from pbfd_torch.terms.torsional_friction import TorsionalFriction
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 # What touches what, as `each_kind` in src/kinds.h has it: candidates are sorted by these.
-CONVEX, UNEVEN = (SphereSurface, SegmentSurface, BoxSurface, CylinderSurface), (HeightSurface, DistanceGrid)
+CONVEX = (SphereSurface, SegmentSurface, BoxSurface, CylinderSurface, ConvexSurface)
+UNEVEN = (HeightSurface, DistanceGrid)
 POINT, BALL, ELLIPSOID = range(3)
 KINDS = (
     *((Plane, support) for support in (POINT, BALL, ELLIPSOID)),
@@ -191,6 +193,8 @@ class Candidates:
                 sizes = [_one(surface.half_extents, 1, name)]
             case CylinderSurface():
                 sizes = [_one(surface.radius, 0, name), _one(surface.half_length, 0, name)]
+            case ConvexSurface():
+                sizes, grid = [surface.size.reshape(1)], self._faceted(surface)
             case HeightSurface():
                 sizes, grid = [surface.origin, surface.spacing], self._sampled(surface.coefficients)
             case DistanceGrid():
@@ -208,6 +212,14 @@ class Candidates:
         first = sum(map(len, self.samples))
         self.samples.append(coefficients.reshape(-1))
         return [first, *coefficients.shape, 1][:4]
+
+    def _faceted(self, surface: ConvexSurface) -> list[int]:
+        """Adds the faces and edges of a hull: where they begin, and how many there are of both."""
+        first = sum(map(len, self.samples))
+        faces = torch.cat((surface.normals, surface.offsets[:, None]), -1)
+        edges = torch.cat((surface.starts, surface.ends), -1)
+        self.samples += [faces.reshape(-1), edges.reshape(-1)]
+        return [first, len(faces), len(edges), 0]
 
     def _add_forms(self, a: Articulation, term: CurvedContact) -> None:
         turn = link_frames(a, term.link)[..., :3, :3]

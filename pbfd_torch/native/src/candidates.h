@@ -12,7 +12,7 @@ struct CandidateSizes {
 };
 
 template <class N, int D> struct Candidates {
-  static constexpr int KINDS = D == 3 ? 11 : 2;  // of pairs, see kinds.h
+  static constexpr int KINDS = D == 3 ? 12 : 2;  // of pairs, see kinds.h
 
   const int* counts;                    // [KINDS] candidates of each kind of pair
   const int *carrier, *solid, *form;    // node; which plane, or which other solid; which ellipsoid
@@ -23,7 +23,7 @@ template <class N, int D> struct Candidates {
   const N *per_release, *per_width;     // [s/m]; one over that of friction [s/m], or over the stretch of an anchor [1/m]
   const N* plane;                       // [D + 1] of a half-space: normal and offset in the world
   // of another solid: rotation and position in the world [12], its sizes [6], its thickness where it is convex; what is sampled
-  // has its samples from the first number of `grid` [4] on, so many along each axis as the others say
+  // has its samples from the first number of `grid` [4] on, so many along each axis as the others say (polyhedron.h: its faces)
   const N *frame, *measure, *thickness;
   const typename Kind<N>::Scalar* sample;  // the same for all worlds
   const int* grid;

@@ -1,6 +1,7 @@
 // The kinds of pairs that touch: in this order candidates are sorted (native/plan_contact.py).
 #pragma once
 #include "grids.h"
+#include "polyhedron.h"
 #include "supports.h"
 
 namespace pbfd {
@@ -26,7 +27,7 @@ template <class N, int D, class F> inline void each_kind(const Candidates<N, D>&
     next(Pair<Plane, Ellipsoid>());
     // a point there is a ball without a radius
     next(Pair<Placed<Globe>, Ball>()), next(Pair<Placed<Pill>, Ball>());
-    next(Pair<Placed<Block>, Ball>()), next(Pair<Placed<Drum>, Ball>());
+    next(Pair<Placed<Block>, Ball>()), next(Pair<Placed<Drum>, Ball>()), next(Pair<Placed<Polyhedron>, Ball>());
     next(Pair<Placed<Terrain>, Ball>()), next(Pair<Placed<Sampled>, Ball>());
     next(Pair<Placed<Terrain>, Ellipsoid>()), next(Pair<Placed<Sampled>, Ellipsoid>());
   }
