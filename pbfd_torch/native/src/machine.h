@@ -32,7 +32,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
            2 * (D * D + D) * s.nodes + (1 + turns(D) + D) * s.nv;
   }
   Machine(const Plan<N, D>& scene, Numbers<V>& numbers, Arena<V>& arena)
-      : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena) {
+      : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena), whole(1) {
     before = taken<State>(arena, plan), after = taken<State>(arena, plan);
     origin = taken<State>(arena, plan), best = taken<State>(arena, plan);
     base = taken<State>(arena, plan), middle = taken<State>(arena, plan), last = taken<State>(arena, plan);

@@ -21,13 +21,13 @@ struct Polyhedron {
     using T = typename Kind<V>::Scalar;
     const int* grid = c.grid + 4 * solid;
     const T *faces = c.sample + grid[0], *edges = faces + 4 * grid[1];
-    V face[3], height = -infinite<V>(), foot[3], overhang = -infinite<V>();
+    V face[3] = {V(0), V(0), V(0)}, height = -infinite<V>(), foot[3], overhang = -infinite<V>();
     for (int f = 0; f < grid[1]; f++) {
       const T* n = faces + 4 * f;
       const V above = over(n, p);
       const auto higher = above > height;
       height = select(higher, above, height);
-      for (int j = 0; j < 3; j++) face[j] = select(higher, V(n[j]), f == 0 ? V(n[j]) : face[j]);
+      for (int j = 0; j < 3; j++) face[j] = select(higher, V(n[j]), face[j]);
     }
     for (int j = 0; j < 3; j++) foot[j] = fma(-height, face[j], p[j]);
     for (int f = 0; f < grid[1]; f++) overhang = max(overhang, over(faces + 4 * f, foot));

@@ -39,7 +39,7 @@ template <class V, class N, int D, class Scheme> struct Starts {
            int last) {
     const T* q = static_cast<const T*>(trial.given[0]);
     T* back = static_cast<T*>(others[0]);
-    V dt;
+    V dt(0);
     for (int i = 0; i < plan.nv; i++) before.acceleration[i] = V(0);
     for (int i = 0; i < plan.remembered(); i++) before.behind[i] = begun.behind[i] = V(T(i < 3 * plan.anchors ? 0 : -1));
     each_block(first, last, [&] {
