@@ -77,7 +77,7 @@ class Live(Served):
         try:
             self.stage = Stage(self.server, self.film)
             self.stage.contacts.points = self.stage.contacts.forces = True
-            self.stage.follows = True
+            self.stage.follows = scene.articulation.topology.link_parent.count(-1) == 1  # of several bodies one may fall off
             self._build(self.server.gui)
             self.stage.look()
         except BaseException:
@@ -184,6 +184,7 @@ class Live(Served):
         dt = gui.add_dropdown("Δt [s]", tuple(f"{x:g}" for x in steps), initial_value=f"{self._dt:g}")
         scheme = gui.add_dropdown("Integrator", tuple(INTEGRATORS), initial_value=self._integrator)
         mu = gui.add_slider("Friction μ", 0.0, 1.5, 0.05, _common_mu(self._scene), hint="Of all contacts, once it is moved.")
+        follow = gui.add_checkbox("Follow", self.stage.follows, hint="Keep the centre of mass in its place.")
         with gui.add_folder("Push"):
             self._add_push(gui)
         with gui.add_folder("Joint targets" if self._targets else "Control"):
@@ -199,6 +200,7 @@ class Live(Served):
         dt.on_update(lambda _: self._change(dt=float(dt.value)))
         scheme.on_update(lambda _: self._change(integrator=scheme.value))
         mu.on_update(lambda _: self._change(mu=float(mu.value)))
+        follow.on_update(lambda _: setattr(self.stage, "follows", follow.value))
 
     def _add_push(self, gui: viser.GuiApi) -> None:
         a = self._scene.articulation
