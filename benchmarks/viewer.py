@@ -1,8 +1,10 @@
-"""What the viewer costs the server: time per frame of 64 worlds side by side, and time and memory to open long rollouts.
+"""What the viewer costs the server: time per frame of 64 worlds side by side, of live mode, and time and memory to open long
+rollouts.
 
     python benchmarks/viewer.py
 
-Prints ms per frame (budget 5 ms: thirty frames a second leave 33), and seconds and peak memory to load and show 100 000 frames.
+Prints ms per frame (budget 5 ms: thirty frames a second leave 33), processor time per picture of live mode in every named scene
+(budget 20 ms: fifty a second), and seconds and peak memory to load and show 100 000 frames.
 """
 
 from __future__ import annotations
@@ -20,9 +22,11 @@ import torch
 
 from pbfd_torch import Rollout, Simulator
 from pbfd_torch.models import SCENES
-from pbfd_torch.viewer import Inspector
+from pbfd_torch.viewer import Inspector, Live
+from pbfd_torch.viewer.live import FRAME
 
 FRAMES = 200
+LIVE_STEP = 0.005  # [s]
 LONG = 100_000
 
 
@@ -58,6 +62,18 @@ def frame_cost() -> None:
     inspector.close()
 
 
+def live_cost() -> None:
+    for name, scene in SCENES.items():
+        live = Live(scene(worlds=1), LIVE_STEP, port=8900)
+        live._paused = True  # its own clock would step it as well
+        live.step(1)
+        began, pictures = time.thread_time(), 20
+        for _ in range(pictures):
+            live.step(round(FRAME / LIVE_STEP))
+        print(f"live {name}: {1e3 * (time.thread_time() - began) / pictures:.2f} ms a picture of {FRAME:g} s")
+        live.close()
+
+
 def open_long(path: Path) -> None:
     started = time.perf_counter()
     rollout = Rollout.load(path)
@@ -83,6 +99,7 @@ def main() -> None:
         open_long(given.open)
         return
     frame_cost()
+    live_cost()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.npz"
         repeated(rolled(1, 200), LONG).save(path)

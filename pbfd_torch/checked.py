@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
+from pbfd_torch.tensors.shapes import broadcast_shapes
 
 Array: TypeAlias = Tensor | NDArray[Any] | Sequence[Any] | float
 """What may be given where a tensor is asked for."""
@@ -48,7 +49,7 @@ def broadcast_batches(batches: dict[str, Sequence[int]]) -> tuple[int, ...]:
     if len(shapes) < 2:  # as it nearly always is
         return shapes.pop() if shapes else ()
     try:
-        return tuple(torch.broadcast_shapes(*batches.values()))
+        return tuple(broadcast_shapes(*batches.values()))
     except RuntimeError as error:
         each = ", ".join(f"{name}: {tuple(shape)}" for name, shape in batches.items() if len(shape))
         raise InputError(

@@ -79,6 +79,49 @@ def test_mjcf_has_our_contacts(name: str) -> None:
             assert data.contact.solref[0] == pytest.approx([0.02, 1.0])
 
 
+@pytest.mark.parametrize("name", mujoco_scenes.LOOSE)
+def test_loose_bodies_have_our_shapes(name: str) -> None:
+    """As far as each reaches along every axis, where it starts; friction; any two may touch each other, and the ground."""
+    setup = SCENES[name]()
+    model = mujoco_runs.loaded(name, 0.01, "discrete")
+    data = data_of(model, setup.q[0], setup.v[0])
+    poses = place(setup.scene.articulation, setup.q[0]).poses.numpy()
+    ours, friction = [], [0.0]
+    for pose, collider in zip(poses, setup.scene.colliders, strict=True):
+        points, radii = collider.shape.candidates()
+        reach = (points @ pose[:3, :3].T + radii[:, None]).max(0)
+        ours.append(reach + pose[:3, 3])
+        friction.append(collider.friction)
+    theirs = []
+    for k in range(1, model.ngeom):
+        turn, size = data.geom_xmat[k].reshape(3, 3), model.geom_size[k]
+        if model.geom_type[k] == mujoco.mjtGeom.mjGEOM_MESH:
+            first = model.mesh_vertadr[model.geom_dataid[k]]
+            vertices = model.mesh_vert[first : first + model.mesh_vertnum[model.geom_dataid[k]]]
+            reach = (vertices @ turn.T).max(0)
+        else:
+            reach = size[:1] if model.geom_type[k] == mujoco.mjtGeom.mjGEOM_SPHERE else np.abs(turn) @ size
+        theirs.append(reach + data.geom_xpos[k])
+    np.testing.assert_allclose(theirs, ours, atol=1e-6)  # vertices are in single precision there
+    friction[0] = setup.scene.obstacles[0].friction
+    np.testing.assert_array_equal(model.geom_friction[:, 0], friction)
+    assert (model.geom_contype == 1).all()
+    assert (model.geom_conaffinity == 1).all()
+
+
+def test_height_field_is_our_terrain() -> None:
+    """Its heights are those of the mesh, where a ray from above meets it: the field is not mirrored, and its floor is as deep."""
+    setup = SCENES["mesh-terrain"]()
+    model = mujoco_runs.loaded("mesh-terrain", 0.01, "discrete")
+    away = setup.q[0].clone()
+    away[2::7] += 100.0
+    data = data_of(model, away, setup.v[0])
+    for x, y in ((0.7, -1.2), (-1.3, 0.4), (1.9, 1.9)):  # at vertices
+        met = mujoco.mj_ray(model, data, np.array([x, y, 2.0]), np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, np.int32))
+        assert 2.0 - met == pytest.approx(0.15 * np.sin(2 * x) * np.cos(1.5 * y), abs=1e-6)
+    assert model.hfield_size[0] == pytest.approx([2.0, 2.0, model.hfield_size[0, 2], 0.5 + float(model.geom_pos[0, 2])])
+
+
 def test_settings_and_bad_names() -> None:
     """Time step and integrator are set; robots keep their contacts' time constant."""
     model = mujoco_runs.loaded("hopper", 0.004, "implicitfast")
@@ -87,7 +130,7 @@ def test_settings_and_bad_names() -> None:
     assert (model.geom_solref[:, 0] == 0.02).all()
     with pytest.raises(InputError, match="no MJCF of the scene 'stack': must be one of chain-fixed"):
         mujoco_scenes.mjcf("stack")
-    assert {*CASES, "quadruped"} == set(mujoco_scenes.NAMES)
+    assert {*CASES, *mujoco_scenes.LOOSE, *mujoco_scenes.ROBOTS} == set(mujoco_scenes.NAMES)
 
 
 # Runs ---------------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from pbfd_torch.bench import mujoco_runs, speed, speed_ours
 from pbfd_torch.bench.speed import Effort, measure_scene
 from pbfd_torch.bench.speed_mujoco import INTEGRATORS, Peer, fewest
 from pbfd_torch.bench.speed_ours import Ours, definition
-from pbfd_torch.bench.speed_scenes import COURSES, Work
+from pbfd_torch.bench.speed_scenes import COURSES, USUAL, Work, bent, nudged, tossed
 from pbfd_torch.bench.speed_table import ratio_lines, ratios
 from tests.command import Pbfd, caller
 
@@ -46,27 +46,60 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", COURSES)
 def test_work(name: str) -> None:
-    """The first world starts as the scene does, the others beside it in their hinges and slides; controls are within the drive
-    around the held one, and every world has its own. Twice the same."""
+    """The first world starts as the scene does, the others beside it; controls are within the drive around the held one, and every
+    world has its own. Twice the same."""
     course = COURSES[name]
     setup, work, again = course.setup(3), course.work(3), course.work(3)
     assert torch.equal(work.q[0], setup.q[0])
     assert torch.equal(work.v[0], setup.v[0])
     assert torch.equal(work.controls, again.controls)
     assert torch.equal(work.q, again.q)
-    a = setup.scene.articulation
-    t = a.topology
-    free = [(q, v) for q, v, (size, _) in zip(t.q_start, t.v_start, t.joint_sizes, strict=True) if size == 7]
-    for q, v in free:  # only its height may be another, so that nothing starts in the ground
-        kept = [q, q + 1, *range(q + 3, q + 7)]
-        torch.testing.assert_close(work.q[:, kept], setup.q[:, kept], rtol=0, atol=1e-15)
-        assert not work.v[:, v : v + 6].any()
-    assert bool((work.q[1] != work.q[2]).any())
+    assert bool((work.v[1] != work.v[2]).any())
     away = work.controls - setup.controls(course.steps)
     assert work.controls.shape == (course.steps, 3, setup.scene.nu)
     assert float(away.abs().max() if away.numel() else 0.0) <= course.drive
     assert work.world_steps == 3 * course.steps
     assert setup.scene.nu == 0 or not torch.equal(work.controls[:, 0], work.controls[:, 1])
+
+
+@pytest.mark.parametrize("name", [name for name, course in COURSES.items() if course.starts is bent])
+def test_bent_starts(name: str) -> None:
+    """Differ in hinges and slides alone."""
+    setup = COURSES[name].setup(3)
+    q, v = bent(setup)
+    t = setup.scene.articulation.topology
+    free = [(i, j) for i, j, (size, _) in zip(t.q_start, t.v_start, t.joint_sizes, strict=True) if size == 7]
+    for i, j in free:  # only its height may be another, so that nothing starts in the ground
+        kept = [i, i + 1, *range(i + 3, i + 7)]
+        torch.testing.assert_close(q[:, kept], setup.q[:, kept], rtol=0, atol=1e-15)
+        assert not v[:, j : j + 6].any()
+    assert bool((q[1] != q[2]).any())
+
+
+def test_starts_of_bodies() -> None:
+    """What falls starts elsewhere and turned; what touches starts where it is, and moves a little."""
+    for name, course in COURSES.items():
+        setup = course.setup(3)
+        q, v = course.starts(setup)
+        if course.starts is tossed:
+            assert name == "mesh-terrain"
+            assert bool((q != setup.q).any(-1).all())
+        if course.starts is nudged:
+            torch.testing.assert_close(q, setup.q, rtol=0, atol=1e-15)
+            assert 0 < float((v - setup.v).abs().max()) < 0.3
+
+
+def test_landing_of_bodies_is_known_to_a_millimetre() -> None:
+    """Its reference at .5 ms, and a smaller step is closer to it."""
+    course = COURSES["mesh-terrain"]
+    if Ours(course, "native", "float64").missing():
+        pytest.skip("there is no core")
+    reference = speed._our_reference(course, 0.0005)
+    errors = [
+        course.case.error(definition(replace(course, dt=dt)).motion(course.case, 0.36), reference.value) for dt in (0.02, 0.004)
+    ]
+    assert reference.uncertainty < 0.001
+    assert errors[1] < errors[0] < 0.005
 
 
 def test_short_runs_start_spread_over_the_record() -> None:
@@ -269,6 +302,17 @@ def test_tables(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pbf
     ):
         assert words in printed
     assert not {x["engine"] for x in json.loads((tmp_path / "speed.json").read_text())["rows"]} & set(INTEGRATORS)
+
+
+def test_scenes_that_mujoco_does_not_have(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pbfd: Pbfd) -> None:
+    """Are compared with PyTorch alone, where they are asked for."""
+    assert "gripper" not in USUAL
+    course = COURSES["gripper"]
+    monkeypatch.setitem(COURSES, "gripper", replace(course, worlds=(1, 3)))
+    ran = pbfd("bench", "speed", "--quick", "--scenes", "gripper", "--out", tmp_path, "--json")
+    assert ran.status == 0
+    assert {row["engine"] for row in ran.data["rows"]} == {"native", "torch"}
+    assert set(ran.data["scenes"]["gripper"]["references"]) == {"pbfd_torch"}
 
 
 def test_unknown_scenes(tmp_path: Path, pbfd: Pbfd) -> None:

@@ -19,11 +19,12 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.bench import mujoco_runs
+from pbfd_torch.bench.mujoco_scenes import NAMES
 from pbfd_torch.bench.precision import OURS, OWN, PEER, Reference, peer_reference, reference_of
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.speed_mujoco import INTEGRATORS, Peer, fewest
 from pbfd_torch.bench.speed_ours import DTYPES, ENGINES, Call, Ours, Record, definition
-from pbfd_torch.bench.speed_scenes import COURSES, Course, Work
+from pbfd_torch.bench.speed_scenes import USUAL, Course, Work
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.solvers.objective import Solution
 
@@ -39,7 +40,7 @@ NOTES = (
     ),
     (
         "a rollout: every world from a start of its own near the scene's, the first from the scene's own, robots under random "
-        "controls; one world: chains from the scene's own start, robots several rollouts, one after another"
+        "controls; one world: the scene's own start, robots several rollouts, one after another"
     ),
     "ours where whole rollouts would take too long, as torch's do: a few steps from states spread evenly over their time",
     (
@@ -50,8 +51,9 @@ NOTES = (
     "steps: in a control step; on chains the fewest with which MuJoCo does not diverge, nor end too far off",
     (
         "error: over one motion from the scene's own start, of each simulator against itself at a fine step (robots: the root "
-        "until .4 s under sines; chain-ground: centre of mass at .4 s, after an impact; later no reference is converged), on "
-        "chain-slope-drop against Coulomb's law after 5 s; ±: by how much the reference changed as its step was halved"
+        "until .4 s under sines; chain-ground, mesh-terrain: centre of mass at .4 and .36 s, after the first impacts; later no "
+        "reference is converged; gripper, turntable, robot-arm: links at .4 s), on chain-slope-drop against Coulomb's law after 5 "
+        "s, on stack-10 and arch against rest; ±: by how much the reference changed as its step was halved"
     ),
     "warm-up: from nothing until the first step, and by how much the first run took longer than the best",
 )
@@ -74,7 +76,7 @@ class Effort:
         own_step, own_peer_step: [s] of the motions that serve as references.
     """
 
-    scenes: tuple[str, ...] = tuple(COURSES)
+    scenes: tuple[str, ...] = USUAL
     worlds: tuple[int, ...] = (1, 64, 256, 1024)
     most_eager: int = 1024
     steps: int = 1000
@@ -92,7 +94,7 @@ class Effort:
 
     def units(self, course: Course, threads: Sequence[int], peers: bool) -> int:
         """How often `measure_scene` tells its progress."""
-        contestants = len(ENGINES) * len(DTYPES) + len(INTEGRATORS) * peers
+        contestants = len(ENGINES) * len(DTYPES) + len(INTEGRATORS) * (peers and course.scene in NAMES)
         return contestants * (1 + len(threads) * len(self.worlds_of(course)))
 
 
@@ -133,7 +135,8 @@ def all_threads() -> tuple[int, ...]:
 
 
 def measure_scene(course: Course, effort: Effort, threads: Sequence[int], peers: bool, progress: Progress) -> dict[str, Any]:
-    """All rows of one scene as plain data. peers: with MuJoCo."""
+    """All rows of one scene as plain data. peers: with MuJoCo, where it has the scene."""
+    peers = peers and course.scene in NAMES
     course = replace(course, steps=min(course.steps, effort.steps))
     work = course.work(max(effort.worlds_of(course)))
     with mujoco_runs.silent() if peers else nullcontext():

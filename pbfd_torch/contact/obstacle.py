@@ -16,6 +16,7 @@ from pbfd_torch.contact.surface import Surface
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import filled
 from pbfd_torch.tensors.facts import fact
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.articulation import homogeneous
 from pbfd_torch.tree.rotations import quaternion_matrix
@@ -56,7 +57,7 @@ class Obstacle(Touchable):
         position = torch.as_tensor(self.position, dtype=dtype, device=device)
         turn = torch.as_tensor(self.quaternion, dtype=dtype, device=device)
         turn = quaternion_matrix(turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True))
-        batch = torch.broadcast_shapes(position.shape[:-1], turn.shape[:-2])
+        batch = broadcast_shapes(position.shape[:-1], turn.shape[:-2])
         return Carrier(homogeneous(turn.expand(*batch, 3, 3), position.expand(*batch, 3)), self.motion)
 
 

@@ -31,7 +31,7 @@ class Recorder(Records):
     """The record of a `NewtonEuler`."""
 
     def __init__(self, scene: Scene, dt: float, q: Tensor, v: Tensor, time: Tensor) -> None:
-        super().__init__(scene, dt)
+        super().__init__(scene, dt, time)
         self._springs = [x for x in scene.terms if isinstance(x, Conservative) and not isinstance(x, Contact | JointLimits)]
         self._begin(self._state(place(scene.articulation, q), v, time))
 

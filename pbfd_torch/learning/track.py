@@ -37,7 +37,7 @@ def tracked(scene: Scene, dt: float, q: Tensor, v: Tensor, name: str) -> Rollout
     """A rollout that holds configurations `[T + 1, worlds, nq]` and velocities `[T + 1, worlds, nv]` of a scene, dt [s] apart."""
     from dataclasses import replace
 
-    track = _Track(replace(scene, name=name), dt)
+    track = _Track(replace(scene, name=name), dt, q.new_zeros(q.shape[1:-1]))
     with torch.no_grad():
         for k, (where, velocity) in enumerate(zip(q, v, strict=True)):
             track.add(where, velocity, torch.full_like(where[..., 0], k * dt))

@@ -146,11 +146,11 @@ class Frames:
         self.made = torch.empty(batch, dtype=torch.int32)
         self.before_last = {name: torch.empty_like(x) for name, x in found.items()}
 
-    def cut(self, count: int) -> Frames:
-        """The first of them."""
+    def part(self, first: int, last: int) -> Frames:
+        """Frames first … last − 1 of them."""
         other = copy.copy(self)
-        other.pace, other.spacing, other.made = self.pace[:count], self.spacing[:count], self.made[:count]
-        other.before_last = {name: x[:count] for name, x in self.before_last.items()}
+        other.pace, other.spacing, other.made = (x[first:last] for x in (self.pace, self.spacing, self.made))
+        other.before_last = {name: x[first:last] for name, x in self.before_last.items()}
         return other
 
 

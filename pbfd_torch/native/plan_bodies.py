@@ -24,6 +24,7 @@ from pbfd_torch.native.plan_contact import along
 from pbfd_torch.native.plan_curved import round_pair, round_table, row_of, shape_row
 from pbfd_torch.native.plan_hulls import hulls
 from pbfd_torch.native.plan_laws import Law, Laws
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.tree.articulation import Articulation, homogeneous
@@ -132,7 +133,7 @@ class Bodies:
             self.sizes.append(torch.cat((torch.nn.functional.pad(size, (0, OWN_FRAMES - len(size))), *frames)))
             belt = self._belt(term, second) - self._belt(term, first)
             some = [x[..., place, None] for x in law.numbers]
-            batch = torch.broadcast_shapes(*(x.shape[:-1] for x in some))
+            batch = broadcast_shapes(*(x.shape[:-1] for x in some))
             self.laws.append(torch.cat([x.expand(*batch, x.shape[-1]) for x in (*some, belt)], -1))
         self.kept.append(term.finder.slots)
         anchored = isinstance(term.friction, AnchoredFriction)

@@ -18,6 +18,7 @@ from pbfd_torch.native.carriers import Carriers
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
 from pbfd_torch.native.plan_laws import Law, Laws
 from pbfd_torch.native.plane import Plane as MotionPlane
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.curved_contact import CurvedContact
@@ -247,7 +248,7 @@ def _one(value: Tensor, rank: int, name: str) -> Tensor:
 
 def joined(*pieces: Tensor, dim: int = -1) -> Tensor:
     """Numbers `[*, n]` side by side along a dimension, counted from the end, some of them of each world."""
-    batch = torch.broadcast_shapes(*(x.shape[:dim] for x in pieces))
+    batch = broadcast_shapes(*(x.shape[:dim] for x in pieces))
     return torch.cat([x.expand(*batch, *x.shape[dim:]) for x in pieces], dim)
 
 

@@ -90,7 +90,7 @@ class Record(Generic[S]):
     """The arrays of a rollout, with room for so many steps from a state. `steps`: those that are in it."""
 
     def __init__(self, writer: Writer[S], state: S, room: int) -> None:
-        self._writer, self.steps, self._lanes = writer, 0, 0
+        self._writer, self._began, self.steps, self._lanes = writer, state.time, 0, 0
         batch = state.q.shape[:-1]
         like, roster = state.q, writer.roster
         count = torch.empty(0, dtype=torch.int32)
@@ -129,7 +129,7 @@ class Record(Generic[S]):
         arrays = {name: x[: self.steps + 1] for name, x in self._states.items()}
         arrays |= {name: x[: self.steps] for name, x in (self._contacts | self._seen | self._solution).items()}
         arrays["substeps"] = self._substeps[: self.steps]
-        return assembled(self._writer.scene, self._writer.dt, self._lanes, arrays)
+        return assembled(self._writer.scene, self._writer.dt, self._began, self._lanes, arrays)
 
 
 def _state_events(scene: Scene) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def rolled_out(
             held = None if controls is None else spread(controls[first : first + part], batch)
             stretch = stepper.stretch(state, held, part)
             told = _told(progress, first, part)
-            record.add(stretch.cut(told))
+            record.add(stretch.part(0, told))
             if told < part:
                 break
             state = stretch.end

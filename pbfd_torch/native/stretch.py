@@ -30,10 +30,11 @@ class Stretch(Generic[S]):
     def __len__(self) -> int:
         return len(self.solution.status)
 
-    def cut(self, count: int) -> Stretch[S]:
-        """The first of them."""
-        states, solution = (mapped(lambda x: x[:count], whole) for whole in (self.states, self.solution))
-        return Stretch(self.before, states, solution, None if self.frames is None else self.frames.cut(count))
+    def part(self, first: int, last: int) -> Stretch[S]:
+        """Steps first … last − 1 of them."""
+        states, solution = (mapped(lambda x: x[first:last], whole) for whole in (self.states, self.solution))
+        before = mapped(lambda x: x[first - 1], self.states) if first else self.before
+        return Stretch(before, states, solution, None if self.frames is None else self.frames.part(first, last))
 
     @property
     def end(self) -> S:

@@ -23,8 +23,9 @@ from pbfd_torch.tree.kinematics import Placement, place
 class Records:
     """One entry per step and quantity; `finish` stacks them."""
 
-    def __init__(self, scene: Scene, dt: float) -> None:
-        self._scene, self._dt = scene, dt
+    def __init__(self, scene: Scene, dt: float, began: Tensor) -> None:
+        """began: when `[*batch]` [s]."""
+        self._scene, self._dt, self._began = scene, dt, began
         self._entries: dict[str, list[Tensor]] = {}
         self.steps = 0
         self._lanes = 0
@@ -72,11 +73,11 @@ class Records:
             empty = like.new_zeros((self.steps, *like.shape[1:-1], 0))
             stacked |= dict.fromkeys(_CONTACT, empty[..., None].expand(*empty.shape, 3)) | {"contact_depth": empty}
         spent = self._lanes if lanes is None else lanes
-        return assembled(self._scene, self._dt, spent, stacked)
+        return assembled(self._scene, self._dt, self._began, spent, stacked)
 
 
-def assembled(scene: Scene, dt: float, lanes: int, arrays: dict[str, Tensor]) -> Rollout:
-    """The rollout of all that is recorded at each step; the rest is the scene's."""
+def assembled(scene: Scene, dt: float, began: Tensor, lanes: int, arrays: dict[str, Tensor]) -> Rollout:
+    """The rollout of all that is recorded at each step from a time `[*batch]` on; the rest is the scene's."""
     like, a = arrays["q"], scene.articulation
     time = dt * torch.arange(len(like), dtype=like.dtype, device=like.device)
     return Rollout(
@@ -88,17 +89,16 @@ def assembled(scene: Scene, dt: float, lanes: int, arrays: dict[str, Tensor]) ->
         lanes=torch.tensor(lanes),
         appearance=depicted(scene),
         time=time,
-        obstacle_poses=_obstacle_poses(scene, time, like.shape[1:-1]),
+        obstacle_poses=_obstacle_poses(scene, time.reshape(-1, *(1 for _ in began.shape)) + began),
         **arrays,
     )
 
 
-def _obstacle_poses(scene: Scene, time: Tensor, batch: torch.Size) -> Tensor:
-    """See `Rollout`."""
+def _obstacle_poses(scene: Scene, time: Tensor) -> Tensor:
+    """See `Rollout`; time: `[steps + 1, *batch]`."""
     a, obstacles = scene.articulation, scene.obstacles
-    moves = any(x.motion.moves for x in obstacles)
-    shape = (len(time) if moves else 1, *batch)
-    when = (time if moves else time[:1]).reshape(-1, *(1 for _ in batch)).expand(shape)
+    when = time if any(x.motion.moves for x in obstacles) else time[:1]
+    shape = when.shape
     poses = [time.new_zeros((*shape, 0, 3, 4))]
     for obstacle in obstacles:
         carrier = obstacle.carrier(a.dtype, a.device)
@@ -119,7 +119,7 @@ class Recorder(Records):
     """The record of a `Simulator`."""
 
     def __init__(self, scene: Scene, integrator: Integrator[Any], dt: float, step_size: Tensor, state: State) -> None:
-        super().__init__(scene, dt)
+        super().__init__(scene, dt, state.time)
         self._step_size = step_size.detach()
         self._integrator = integrator
         self._begin(self._state(state, place(scene.articulation, state.q)))

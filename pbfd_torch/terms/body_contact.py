@@ -22,6 +22,7 @@ from pbfd_torch.contact.hazards import Hazard, Overflow, marked
 from pbfd_torch.contact.obstacle import Carrier
 from pbfd_torch.contact.surface import Placed
 from pbfd_torch.errors import ContactOverflowError
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tensors.vectors import applied, extended, in_frames, mapped, outer
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive
@@ -253,7 +254,7 @@ def _of_pairs(values: Tensor, pair: Tensor) -> Tensor:
 
 def of_slots(bodies: Tensor, index: Tensor) -> Tensor:
     """`[*batch, nbody, r, 4], [*batch, n] → [*batch, n, 3, 4]`; either may be that of one world for all."""
-    batch = torch.broadcast_shapes(bodies.shape[:-3], index.shape[:-1])
+    batch = broadcast_shapes(bodies.shape[:-3], index.shape[:-1])
     place = index[..., None, None].expand(*batch, index.shape[-1], 3, 4)
     return bodies[..., :3, :].expand(*batch, *bodies.shape[-3:-2], 3, 4).take_along_dim(place, -3)
 

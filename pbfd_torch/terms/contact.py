@@ -23,6 +23,7 @@ from pbfd_torch.contact.surface import Field, Surface, Tangent
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, turned
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
@@ -127,7 +128,7 @@ class Contact(ContactLaws[PreparedContact]):
         try:
             shape = self.normal_force.force(zero)[0].shape
             if self.friction is not None:
-                shape = torch.broadcast_shapes(shape, self.friction.drag(zero, zero, zero, torch.ones_like(zero)).shape)
+                shape = broadcast_shapes(shape, self.friction.drag(zero, zero, zero, torch.ones_like(zero)).shape)
         except RuntimeError as error:
             raise InputError(
                 f"a parameter of the normal force or the friction does not fit the {count} candidates: must be one number or end "

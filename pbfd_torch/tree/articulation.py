@@ -20,6 +20,7 @@ from torch import Tensor
 
 from pbfd_torch.errors import InputError, ModelError
 from pbfd_torch.tensors.facts import fact
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.bounds import HEAVIEST, LIGHTEST, MASSES
 from pbfd_torch.tree.rotations import quaternion_matrix, skew
@@ -277,7 +278,7 @@ def reach(articulation: Articulation) -> Tensor:
     """Length scale of the articulation [m] `[*]`, at least 1 cm: distances from joint to joint summed, plus the largest radius of
     gyration of a link about its own frame."""
     each = articulation.joint_frame[..., :3, 3], articulation.link_frame[..., :3, 3]
-    batch = torch.broadcast_shapes(*(x.shape[:-2] for x in each))
+    batch = broadcast_shapes(*(x.shape[:-2] for x in each))
     frames = torch.cat([x.expand(*batch, *x.shape[-2:]) for x in each], -2)
     second = articulation.pseudo_inertia[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(0)
     mass = articulation.mass

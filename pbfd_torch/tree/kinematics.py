@@ -11,6 +11,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 from pbfd_torch.tree.rotations import (
     quaternion_conjugate,
@@ -100,7 +101,7 @@ def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
         groups.append(articulation.joint_frame[..., t.turning_joint, :, :] @ turned)
     if len(groups) == 1:
         return groups[0]
-    batch = torch.broadcast_shapes(*(g.shape[:-3] for g in groups))
+    batch = broadcast_shapes(*(g.shape[:-3] for g in groups))
     local = torch.cat([g.expand(*batch, *g.shape[-3:]) for g in groups], -3)
     return local if t.node_order is None else local[..., t.node_order, :, :]
 

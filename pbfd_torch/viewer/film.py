@@ -35,13 +35,15 @@ class Touches:
 
 
 class Film:
-    """A rollout with its batch as one axis. Nothing is copied: frames are cut out when they are asked for."""
+    """A rollout with its batch as one axis. Nothing is copied: frames are cut out when they are asked for. `home`: the centre of
+    mass where the motion began `[worlds, 3]`."""
 
     def __init__(self, rollout: Rollout) -> None:
         self.rollout = rollout
+        self.home = self.center[0]
 
     def renew(self, rollout: Rollout) -> None:
-        """Goes on with another record of the same scene; what is known of sizes stays."""
+        """Goes on with another record of the same scene; what is known of sizes, and where it began, stays."""
         self.rollout = rollout
         for name in ("links", "center", "_obstacles"):
             self.__dict__.pop(name, None)

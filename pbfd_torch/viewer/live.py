@@ -18,11 +18,11 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.solvers.objective import Status
+from pbfd_torch.solvers.objective import Solution, Status
+from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.load import Term
 from pbfd_torch.terms.pushes import Pushes
@@ -30,9 +30,10 @@ from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.film import Film
 from pbfd_torch.viewer.served import Served
 from pbfd_torch.viewer.stage import Stage
+from pbfd_torch.viewer.strides import recorded, strode
 
 STEPS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)  # [s] to choose from
-_KEPT = 2  # frames of the record: the last two states
+FRAME = 0.02  # [s] from picture to picture where steps are shorter, and the longest that steps are made without one
 _WIDEST = math.pi  # [rad or m] of a joint's slider without limits
 _SERVO = 20.0  # [rad/s] how fast a joint follows its slider, critically damped
 
@@ -56,8 +57,10 @@ class Live(Served):
         if integrator not in INTEGRATORS:
             raise InputError(f"integrator is '{integrator}': must be one of {', '.join(INTEGRATORS)}")
         super().__init__()
+        first = Worlds((setup.worlds,), torch.zeros(1, dtype=torch.long))
+        setup = dataclasses.replace(setup, scene=setup.scene.take(first), q=setup.q[:1], v=setup.v[:1])
         scene = setup.scene
-        self._start = setup.q[:1], setup.v[:1]
+        self._start = setup.q, setup.v
         self._targets = not scene.nu
         self._scene = _with_servos(scene) if self._targets else scene
         self._dt, self._integrator = setup.dt if dt is None else dt, integrator
@@ -68,13 +71,13 @@ class Live(Served):
         self._paused = False
         self.steps, self.time = 0, 0.0
         self._rebuild(*self._start)
-        self.film = Film(self._record(*self._advanced()))
+        self.film = Film(self._advanced(1)[0])
         self._rebuild(*self._start)
         self.server = serving.start(host, port, origins=origins)
         try:
             self.stage = Stage(self.server, self.film)
             self.stage.contacts.points = self.stage.contacts.forces = True
-            self.stage.follows = True
+            self.stage.follows = scene.articulation.topology.link_parent.count(-1) == 1  # of several bodies one may fall off
             self._build(self.server.gui)
             self.stage.look()
         except BaseException:
@@ -106,49 +109,52 @@ class Live(Served):
         simulator = self._simulator
         return simulator.integrator.velocity(simulator.articulation, self._state, simulator.step_size)
 
-    def _advanced(self) -> tuple[Any, Any, Any]:
-        before = self._state
-        self._state, solution, way = self._simulator.stepper.made(before, self._control)
-        return before, solution, way.objective or self._simulator.objective(before, self._control)
-
-    def _record(self, before: Any, solution: Any, objective: Any) -> Rollout:
-        recorder = Recorder(self._simulator.scene, self._simulator.integrator, self._dt, self._simulator.step_size, before)
-        recorder.record(self._state, solution, objective)
-        return recorder.finish()
+    def _advanced(self, most: int) -> tuple[Rollout, list[Solution]]:
+        """Up to so many steps, as long as they take no longer than a picture: the record of the last, and how they were solved, a
+        few `[steps, 1]` at a time."""
+        usual, control = max(1, round(FRAME / self._dt)), self._control
+        solutions: list[Solution] = []
+        began, count = time.perf_counter(), 0
+        while count < most and (count == 0 or time.perf_counter() - began < FRAME):
+            stride = strode(self._simulator, self._state, control, min(usual, most - count))
+            self._state, count = stride.end, count + len(stride)
+            solutions.append(stride.solution)
+        return recorded(self._simulator, stride, control), solutions
 
     def _run(self) -> None:
         due = time.perf_counter()
         while not self._closed.is_set():
-            if self._paused:
-                time.sleep(0.02)
-                due = time.perf_counter()
-                continue
-            self.step()
-            due += self._dt
-            late = time.perf_counter() - due
+            late = max(0.0, time.perf_counter() - due)
             if late > 0.25:  # slower than real time: it does not try to catch up
-                due = time.perf_counter()
-            elif late < 0:
-                self._closed.wait(-late)
+                due, late = time.perf_counter(), 0.0
+            with self._lock:  # a reset is not followed by a step that was begun before it
+                due += FRAME if self._paused else self._dt * self.step(max(1, round((FRAME + late) / self._dt)))
+            self._closed.wait(max(0.0, due - time.perf_counter()))
 
-    def step(self) -> None:
-        """One step, drawn."""
+    def step(self, most: int = 1) -> int:
+        """A step, or up to so many, as long as they take no longer than a picture; draws the last. How many there were."""
         with self._lock:
             started = time.perf_counter()
-            before, solution, objective = self._advanced()
-            self.film.renew(self._record(before, solution, objective))
-            self.steps += 1
-            self.time += self._dt
+            record, solutions = self._advanced(most)
+            self.film.renew(record)
+            status, solved, evaluations = (
+                torch.cat([getattr(x, name)[:, 0] for x in solutions]) for name in ("status", "solved", "evaluations")
+            )
+            count = len(status)
+            self.steps += count
+            self.time += count * self._dt
             spent = time.perf_counter() - started
             if self._closed.is_set():
-                return
-            self.stage.show(_KEPT - 1)
-            status = Status(int(solution.status[0])).name.lower().replace("_", " ")
-            red = "" if bool(solution.solved[0]) else "**"
+                return count
+            self.stage.show(record.steps)
+            shown = -1 if bool(solved.all()) else int(solved.long().argmin())  # the first that was not solved, or the last
+            word = Status(int(status[shown])).name.lower().replace("_", " ")
+            red = "" if bool(solved[shown]) else "**"
             self._words.content = (
-                f"{self.time:.2f} s · {red}{status}{red}, {int(solution.evaluations[0])} evaluations · "
-                f"{self._dt / max(spent, 1e-9):.1f} × real time at most"
+                f"{self.time:.2f} s · {red}{word}{red}, {int(evaluations[shown])} evaluations · "
+                f"{count * self._dt / max(spent, 1e-9):.1f} × real time at most"
             )
+        return count
 
     def reset(self) -> None:
         """Back to the start, drawn."""
@@ -178,6 +184,7 @@ class Live(Served):
         dt = gui.add_dropdown("Δt [s]", tuple(f"{x:g}" for x in steps), initial_value=f"{self._dt:g}")
         scheme = gui.add_dropdown("Integrator", tuple(INTEGRATORS), initial_value=self._integrator)
         mu = gui.add_slider("Friction μ", 0.0, 1.5, 0.05, _common_mu(self._scene), hint="Of all contacts, once it is moved.")
+        follow = gui.add_checkbox("Follow", self.stage.follows, hint="Keep the centre of mass in its place.")
         with gui.add_folder("Push"):
             self._add_push(gui)
         with gui.add_folder("Joint targets" if self._targets else "Control"):
@@ -193,6 +200,7 @@ class Live(Served):
         dt.on_update(lambda _: self._change(dt=float(dt.value)))
         scheme.on_update(lambda _: self._change(integrator=scheme.value))
         mu.on_update(lambda _: self._change(mu=float(mu.value)))
+        follow.on_update(lambda _: setattr(self.stage, "follows", follow.value))
 
     def _add_push(self, gui: viser.GuiApi) -> None:
         a = self._scene.articulation

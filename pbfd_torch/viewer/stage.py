@@ -78,7 +78,7 @@ class Stage:
         """Where the root is so that the first world's centre of mass stays in its place."""
         if not self.follows:
             return (0.0, 0.0, 0.0)
-        moved = (self.film.center[0, self.worlds[0]] - self.film.center[frame, self.worlds[0]]).cpu().double().numpy()
+        moved = (self.film.home[self.worlds[0]] - self.film.center[frame, self.worlds[0]]).cpu().double().numpy()
         x, y, z = np.nan_to_num(moved).tolist()
         return x, y, z
 

@@ -45,7 +45,10 @@ inline void spline(const typename Kind<V>::Scalar* sample, const int* size, cons
   for (int i = 0; i < Kind<V>::lanes; i++) {
     int rows[4], places[4];
     x.nodes(i, size[0], rows), y.nodes(i, size[1], places);
-    for (int j = 0; j < 16; j++) put(values[j], i, sample[rows[j / 4] * size[1] + places[j % 4]]);
+    for (int a = 0; a < 4; a++) {
+      const auto* row = sample + rows[a] * size[1];
+      for (int b = 0; b < 4; b++) put(values[4 * a + b], i, row[places[b]]);
+    }
   }
   for (int a = 0; a <= ORDER; a++) {
     for (int k = 0; k < 4; k++) columns[k] = x.along(a, values + k, 4);
@@ -62,8 +65,11 @@ inline void spline(
   for (int i = 0; i < Kind<V>::lanes; i++) {
     int rows[4], lines[4], places[4];
     x.nodes(i, size[0], rows), y.nodes(i, size[1], lines), z.nodes(i, size[2], places);
-    for (int j = 0; j < 64; j++)
-      put(values[j], i, sample[(rows[j / 16] * size[1] + lines[j / 4 % 4]) * size[2] + places[j % 4]]);
+    for (int a = 0; a < 4; a++)
+      for (int b = 0; b < 4; b++) {
+        const auto* line = sample + (rows[a] * size[1] + lines[b]) * size[2];
+        for (int c = 0; c < 4; c++) put(values[16 * a + 4 * b + c], i, line[places[c]]);
+      }
   }
   for (int a = 0; a <= ORDER; a++) {
     for (int k = 0; k < 16; k++) sheets[k] = x.along(a, values + k, 16);
