@@ -295,7 +295,7 @@ def test_tables_on_the_terminal_and_status(ran: Ran, monkeypatch: pytest.MonkeyP
     for simulator, status in (("conventional", 0), ("implicit-euler", 1)):
         shown = copy.deepcopy(ran.data)
         next(row for row in shown["time_steps"] if row["simulator"] == simulator)["unsolved_steps"] = 3
-        monkeypatch.setattr(bench_slope, "measured", lambda effort, shown=shown: shown)
+        monkeypatch.setattr(bench_slope, "measured", lambda *arguments, shown=shown: shown)
         assert call(monkeypatch) == status
         printed = " ".join(capsys.readouterr().out.split())
         for words in ("(b) pitched by 20°", "(c)", "(d)", "MuJoCo RK4", "HOLD", figure_6_claims.NOTES[0], "figure-6.png"):
@@ -306,7 +306,7 @@ def test_duration_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     """--duration replaces that of the effort, quick or not."""
     asked: list[Effort] = []
 
-    def measured(effort: Effort) -> dict[str, Any]:
+    def measured(effort: Effort, engine: object) -> dict[str, Any]:
         asked.append(effort)
         return {"time_steps": [], "contacts": [], "friction": []}
 

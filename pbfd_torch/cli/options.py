@@ -8,9 +8,10 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import typer
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
@@ -56,6 +57,17 @@ class EngineChoice(enum.StrEnum):
     NATIVE = "native"
     TORCH = "torch"
 
+    @staticmethod
+    def engine(choice: EngineChoice | None) -> Engine | None:
+        """What was chosen; None: the core where it can."""
+        return None if choice is None else _ENGINES[choice]
+
+
+EngineOption = Annotated[
+    EngineChoice | None,
+    typer.Option("--engine", help="What makes the steps; default: the compiled core where it can, else torch."),
+]
+
 
 class Friction(enum.StrEnum):
     COULOMB = "coulomb"
@@ -87,7 +99,7 @@ _SOLVERS: dict[SolverChoice, Callable[[], Solver]] = {
     SolverChoice.LBFGS: lambda: OnSquares(lbfgs()),
 }
 
-_ENGINES: dict[EngineChoice | None, Engine | None] = {None: None, EngineChoice.NATIVE: Native(), EngineChoice.TORCH: Torch()}
+_ENGINES: dict[EngineChoice, Engine] = {EngineChoice.NATIVE: Native(), EngineChoice.TORCH: Torch()}
 
 
 @dataclass(frozen=True)
@@ -126,7 +138,7 @@ class Choices:
         """Raises `InputError` for a Δt or an accuracy out of range, and for an engine that cannot."""
         integrator, solver = INTEGRATORS[self.integrator.value](), self.make_solver()
         if self.accuracy is None:
-            return Simulator(scene, dt, integrator, solver, engine=_ENGINES[self.engine])
+            return Simulator(scene, dt, integrator, solver, engine=EngineChoice.engine(self.engine))
         return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver)
 
 
