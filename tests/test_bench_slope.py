@@ -163,6 +163,7 @@ def made_up(broken_at: float = math.inf, slower: float = 1.0, ours: float = 1.0)
         }
 
     steps = [row("implicit-euler", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
+    steps += [row("implicit-euler-torch", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
     steps += [row("energy-momentum", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
     steps += [row("conventional", dt, 0.08 / dt) for dt in (0.001, 0.0025, 0.1)]
     contacts = [row("implicit-euler", 0.1, 10.0 * ours * k, points=n, in_touch=10.0 * n) for n, k in ((2, 1.0), (32, 1.2))]
@@ -281,7 +282,7 @@ def test_progress_counts_every_run(ran: Ran, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(
         figure_6, "measure_run", lambda simulator, case, *_, **__: {**case.__dict__, "simulator": simulator, "stable": True}
     )
-    for version, simulators in ((mujoco_runs.version(), 6), (None, 3)):
+    for version, simulators in ((mujoco_runs.version(), 7), (None, 4)):
         monkeypatch.setattr(mujoco_runs, "version", lambda version=version: version)
         told: list[int] = []
         found = figure_6.measure(TINY, told.append)

@@ -1,7 +1,8 @@
 """Fig. 6 of the paper: what ten seconds of a chain sliding off a slope cost, against Δt, contacts in touch, and friction.
 
-Ours and the conventional stepper take the same scene from the same starts; `figure_6_peers` has MuJoCo do it. A run gives one row
-of plain data: which engine made it, whether it was stable, how wrong it was, and what it cost. `figure_6_claims` holds the rows
+Ours and the conventional stepper take the same scene from the same starts; `figure_6_peers` has MuJoCo do it. The conventional
+stepper is in PyTorch, so the paper's integrator is there in PyTorch too, to compare times of like with like. A run gives one row of
+plain data: which engine made it, whether it was stable, how wrong it was, and what it cost. `figure_6_claims` holds the rows
 against the paper.
 """
 
@@ -138,9 +139,11 @@ class Formulation:
     make: Callable[[Scene, float, Engine | None], Steps]
 
 
-def _ours(integrator: Callable[[], Any]) -> Callable[[Scene, float, Engine | None], Steps]:
+def _ours(integrator: Callable[[], Any], by: Engine | None = None) -> Callable[[Scene, float, Engine | None], Steps]:
+    """`by`: an engine whatever is asked for."""
+
     def make(scene: Scene, dt: float, engine: Engine | None) -> Steps:
-        simulator = Simulator(scene, dt, integrator(), engine=engine)
+        simulator = Simulator(scene, dt, integrator(), engine=by or engine)
         return Steps(
             simulator.engine,
             simulator.initial_state,
@@ -167,12 +170,15 @@ def pose_rates(scene: Scene, q: Tensor, v: Tensor) -> Tensor:
     return Motion(place(scene.articulation, q), v).rates
 
 
+EAGER = "implicit-euler-torch"
 FORMULATIONS = {
     "implicit-euler": Formulation("ours, Euler", _ours(ImplicitEuler)),
+    EAGER: Formulation("ours, Euler, PyTorch", _ours(ImplicitEuler, Torch())),
     "energy-momentum": Formulation("ours, energy–mom.", _ours(EnergyMomentum)),
     "conventional": Formulation("Newton–Euler", _newton_euler),
 }
-OURS = ("implicit-euler", "energy-momentum")
+OURS = ("implicit-euler", EAGER, "energy-momentum")
+COARSE = (EAGER, "energy-momentum")  # in panel (b) alone
 TITLES = {key: x.title for key, x in FORMULATIONS.items()} | {key: x.title for key, x in figure_6_peers.PEERS.items()}
 # in panel (b), how many times as many steps as others: cheap ones, whose stability is to be seen
 REACH = {"conventional": 4, **dict.fromkeys(figure_6_peers.PEERS, 10_000)}
@@ -301,15 +307,15 @@ def best_step(rows: Sequence[Row], simulator: str, start: str) -> float | None:
 def measure(effort: Effort, progress: Progress, engine: Engine | None = None) -> dict[str, Any]:
     """The three panels as plain data, ours by an engine: rows of (b) `time_steps`, (c) `contacts`, (d) `friction`, both of the
     start `SCENE`; `best_dt`: start → simulator → Δt, `own_dt` what (c) and (d) take for it; and a `picture` of the scene. Without
-    MuJoCo, its rows are missing. Energy–momentum is in (b) alone."""
-    peers = list(figure_6_peers.PEERS) if mujoco_runs.version() else []
+    MuJoCo, its rows are missing. Those of `COARSE` are in (b) alone."""
+    simulators = _simulators(engine)
     steps = []
-    for simulator, start, dt in [(x, y, z) for y in effort.starts for x in [*FORMULATIONS, *peers] for z in effort.time_steps]:
+    for simulator, start, dt in [(x, y, z) for y in effort.starts for x in simulators for z in effort.time_steps]:
         case = effort.case(start, dt, REACH.get(simulator, 1))
         steps.append(measure_run(simulator, case, effort.worlds, effort.batch_steps, effort.repeats, engine))
         progress(1)
-    best = {start: {key: best_step(steps, key, start) for key in (*FORMULATIONS, *peers)} for start in effort.starts}
-    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key != "energy-momentum"}
+    best = {start: {key: best_step(steps, key, start) for key in simulators} for start in effort.starts}
+    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key not in COARSE}
     contacts = []
     for simulator, points in [(x, y) for x in own for y in effort.points]:
         for dt in sorted({own[simulator], COMMON_STEP}):
@@ -332,11 +338,17 @@ def measure(effort: Effort, progress: Progress, engine: Engine | None = None) ->
     }
 
 
-def units(effort: Effort) -> int:
+def _simulators(engine: Engine | None) -> list[str]:
+    """Those that can be run; ours in PyTorch is not run twice."""
+    ours = [key for key in FORMULATIONS if not (key == EAGER and engine == Torch())]
+    return [*ours, *(figure_6_peers.PEERS if mujoco_runs.version() else ())]
+
+
+def units(effort: Effort, engine: Engine | None = None) -> int:
     """What `measure` tells its progress in all."""
-    peers = len(figure_6_peers.PEERS) if mujoco_runs.version() else 0
-    refined = len(FORMULATIONS) - 1 + peers
-    steps = len(effort.starts) * len(effort.time_steps) * (len(FORMULATIONS) + peers)
+    simulators = _simulators(engine)
+    refined = sum(key not in COARSE for key in simulators)
+    steps = len(effort.starts) * len(effort.time_steps) * len(simulators)
     return steps + refined * len(effort.points) + (refined + 1) * len(effort.frictions)
 
 

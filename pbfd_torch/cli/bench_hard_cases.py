@@ -87,7 +87,7 @@ def measured(runs: Sequence[tuple[Case, Run]], quick: bool) -> tuple[list[Result
         "failed": sum(bool(result.failed) for result in results),
         "laws": {case.name: case.law for case, _ in runs},
         "results": [result.plain() for result in results],
-        "notes": [*NOTES, f"{engines.in_words((x.case, x.engine) for x in results)}."],
+        "notes": [*NOTES, f"{engines.in_words((f'{x.case} by {x.integrator}', x.engine) for x in results)}."],
     }
 
 

@@ -73,8 +73,8 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort, 
         for name in scenes:
             bar.set_description(name)
             found[name] = measure_scene(CASES[name], integrators, peers, effort, bar.update, engine)
-    rows = [row for scene in found.values() for row in scene["rows"]]
-    made = [(PEER if row["simulator"] == PEER else row["integrator"], row["engine"]) for row in rows]
+    ours = [row for scene in found.values() for row in scene["rows"] if row["simulator"] != PEER]
+    made = engines.in_words((row["integrator"], row["engine"]) for row in ours)
     return {
         "wall_s": time.perf_counter() - started,
         "environment": environment() | {"mujoco": version},
@@ -82,7 +82,7 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort, 
         "integrators": list(integrators),
         "scenes": found,
         "losses": losses(found),
-        "notes": [*NOTES, engines.in_words(made), *mujoco_runs.absent("ours alone")],
+        "notes": [*NOTES, made, *mujoco_runs.absent("ours alone")],
     }
 
 

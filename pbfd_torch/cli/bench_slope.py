@@ -56,17 +56,16 @@ def slope(
 def measured(effort: Effort, engine: Engine | None) -> dict[str, Any]:
     """Everything as plain data; with a progress bar on a terminal."""
     from pbfd_torch.bench import engines, mujoco_runs
-    from pbfd_torch.bench.figure_6 import TITLES, measure, units
+    from pbfd_torch.bench.figure_6 import FORMULATIONS, TITLES, measure, units
     from pbfd_torch.bench.figure_6_claims import NOTES, claims
 
     started = time.perf_counter()
     version = mujoco_runs.version()
     shortened = (f"at most {effort.most_steps} steps a run; in (b) Newton–Euler takes up to 4 times as many, MuJoCo all",)
-    with tqdm(total=units(effort), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
+    with tqdm(total=units(effort, engine), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
         found = measure(effort, bar.update, engine)
-    made = engines.in_words(
-        (TITLES[row["simulator"]], row["engine"]) for panel in ("time_steps", "contacts", "friction") for row in found[panel]
-    )
+    rows = [row for panel in ("time_steps", "contacts", "friction") for row in found[panel]]
+    made = engines.in_words((TITLES[row["simulator"]], row["engine"]) for row in rows if row["simulator"] in FORMULATIONS)
     report = {"duration_s": effort.duration, "worlds": effort.worlds, **found}
     return {
         "wall_s": time.perf_counter() - started,
