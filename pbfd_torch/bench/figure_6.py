@@ -178,7 +178,7 @@ FORMULATIONS = {
     "conventional": Formulation("Newton–Euler", _newton_euler),
 }
 OURS = ("implicit-euler", EAGER, "energy-momentum")
-COARSE = (EAGER, "energy-momentum")  # in panel (b) alone
+IN_B_ALONE = (EAGER, "energy-momentum")  # not in panels (c) and (d)
 TITLES = {key: x.title for key, x in FORMULATIONS.items()} | {key: x.title for key, x in figure_6_peers.PEERS.items()}
 # in panel (b), how many times as many steps as others: cheap ones, whose stability is to be seen
 REACH = {"conventional": 4, **dict.fromkeys(figure_6_peers.PEERS, 10_000)}
@@ -307,7 +307,7 @@ def best_step(rows: Sequence[Row], simulator: str, start: str) -> float | None:
 def measure(effort: Effort, progress: Progress, engine: Engine | None = None) -> dict[str, Any]:
     """The three panels as plain data, ours by an engine: rows of (b) `time_steps`, (c) `contacts`, (d) `friction`, both of the
     start `SCENE`; `best_dt`: start → simulator → Δt, `own_dt` what (c) and (d) take for it; and a `picture` of the scene. Without
-    MuJoCo, its rows are missing. Those of `COARSE` are in (b) alone."""
+    MuJoCo, its rows are missing. Those of `IN_B_ALONE` are not in (c) and (d)."""
     simulators = _simulators(engine)
     steps = []
     for simulator, start, dt in [(x, y, z) for y in effort.starts for x in simulators for z in effort.time_steps]:
@@ -315,7 +315,7 @@ def measure(effort: Effort, progress: Progress, engine: Engine | None = None) ->
         steps.append(measure_run(simulator, case, effort.worlds, effort.batch_steps, effort.repeats, engine))
         progress(1)
     best = {start: {key: best_step(steps, key, start) for key in simulators} for start in effort.starts}
-    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key not in COARSE}
+    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key not in IN_B_ALONE}
     contacts = []
     for simulator, points in [(x, y) for x in own for y in effort.points]:
         for dt in sorted({own[simulator], COMMON_STEP}):
@@ -347,7 +347,7 @@ def _simulators(engine: Engine | None) -> list[str]:
 def units(effort: Effort, engine: Engine | None = None) -> int:
     """What `measure` tells its progress in all."""
     simulators = _simulators(engine)
-    refined = sum(key not in COARSE for key in simulators)
+    refined = sum(key not in IN_B_ALONE for key in simulators)
     steps = len(effort.starts) * len(effort.time_steps) * len(simulators)
     return steps + refined * len(effort.points) + (refined + 1) * len(effort.frictions)
 
