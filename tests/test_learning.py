@@ -197,6 +197,7 @@ def test_policies_on_trial_elsewhere(trained: Path, tmp_path: Path) -> None:
         assert trial.rollout.link_names == trials[0].rollout.link_names
         trial.rollout.save(tmp_path / "x.npz")
         assert Rollout.load(tmp_path / "x.npz").scene_name == f"cart-pole, {trial.on}"
+    assert [trial.engine for trial in trials] == [make_env("cart-pole").simulator.engine, "torch", "mujoco"]
     assert trials[0].mean > 60
     draw({"pole": trials}, tmp_path / "bars.png")
     assert (tmp_path / "bars.png").stat().st_size > 5000

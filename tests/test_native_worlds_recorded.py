@@ -22,7 +22,7 @@ from pbfd_torch.native.engine import Native
 from pbfd_torch.native.library import library
 from pbfd_torch.native.plan import planned
 from pbfd_torch.native.roster import rostered
-from pbfd_torch.native.stepper import NativeStepper, uncovered
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.contact import Contact
@@ -206,11 +206,10 @@ def test_anchors(name: str) -> None:
     require_same(*recorded(Simulator(scene, DT, engine=Native()), state, held(scene, 3), 3))
 
 
-def test_bdf2_of_worlds_that_differ_is_said_not_to_be_covered() -> None:
-    """But for their friction: starts, steps, what these remember, and records."""
-    words = "the core does not know BDF2 of worlds that differ"
-    assert uncovered(Simulator(differing(robot(), only("gravity")), DT, Bdf2()).eager) == words
-    scene = differing(robot(), only(f"{CONTACT}friction.mu"))
+@pytest.mark.parametrize("names", [only(f"{CONTACT}friction.mu"), only("gravity"), DIFFERENCES], ids=["friction", "gravity", "all"])
+def test_bdf2(names: Mapping[str, Difference]) -> None:
+    """Starts, steps, what these remember, and records."""
+    scene = differing(robot(), names)
     simulator: Simulator[Any] = Simulator(scene, DT, Bdf2(), engine=Native())
     native, same, (beside, _) = NativeStepper(simulator.eager), control(scene), start(scene)
     state, direct, alike = native.initial_state(beside.q, beside.v, same), 0, 0

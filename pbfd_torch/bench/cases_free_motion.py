@@ -25,11 +25,9 @@ from pbfd_torch.bench.hard_cases_case import (
     rise,
 )
 from pbfd_torch.bench.hard_cases_scenes import GRAVITY, body, down, placed, row, weightless
-from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models.spinning import dzhanibekov as dzhanibekov_setup
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
-from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
@@ -56,7 +54,7 @@ def rotation_oracle(run: Run) -> Sequence[Check]:
     link = Link("body", joints=(Joint("free", JointKind.FREE),), mass=1.7, com=(0.2, -0.1, 0.3), inertia=rows)
     articulation = Articulation.from_links([link])
     scene = Scene(articulation, (Inertia(),), weightless())
-    simulator = Simulator(scene, run.dt, ImplicitEuler(), Descent(tolerance=1e-13))
+    simulator = run.simulator(scene, solver=Descent(tolerance=1e-13))
     state = simulator.initial_state(placed(0.5, (0.3, 0.2, -0.7)), row(1, -1, 0.5, 0.3 / run.dt, -0.2 / run.dt, 0.5 / run.dt))
     after, solution = simulator.step(state)
     before, now, then = (place(articulation, q) for q in (state.q_previous, state.q, after.q))

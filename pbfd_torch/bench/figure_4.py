@@ -1,6 +1,7 @@
 """Fig. 4 of the paper: iterations and time of every step, for the six cases of Table I and our default, on two chains.
 
-Every case solves the same steps, each from the state where the default's rollout had come to, so that iterations compare.
+Every case solves the same steps, each from the state where the default's rollout had come to, so that iterations compare. The
+rollout is the engine's; the cases, whose solvers are compared, are solved in PyTorch, all of them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pbfd_torch.bench.timing import Progress, timed, worst
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models.chains import LENGTH
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.native.engine import Torch
+from pbfd_torch.native.engine import Engine
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
@@ -37,7 +38,10 @@ REFERENCE_TOLERANCE = 1e-12
 BUDGETS = {"L-BFGS, E": 1000, "L-BFGS, GE": 1000, "LM, GE": 50}
 USUAL_BUDGET = 400
 NOTES = (
-    "every case solves the same steps, each from the state where the default's rollout had come to; the time is that of the solve",
+    (
+        "every case solves the same steps, in PyTorch, each from the state where the default's rollout had come to; the time is "
+        "that of the solve"
+    ),
     (
         "on E friction is lagged, i.e. held at the normal forces at the start of the step, because Coulomb friction is no energy: "
         "where something touches, these cases solve another problem, and their tip error says how far off that is"
@@ -93,9 +97,8 @@ def tip(objective: BalanceObjective, q: Tensor) -> Tensor:
     return last[..., 3] + LENGTH * last[..., 0]
 
 
-def given_steps(setup: Setup, dt: float, steps: int) -> list[GivenStep]:
+def given_steps(simulator: Simulator[Any], setup: Setup, steps: int) -> list[GivenStep]:
     """The steps of the default's rollout, with their reference solutions."""
-    simulator = Simulator(setup.scene, dt, engine=Torch())
     reference = Descent(tolerance=REFERENCE_TOLERANCE)
     state: State = simulator.initial_state(setup.q, setup.v)
     given = []
@@ -185,11 +188,15 @@ def _spread_of(values: Sequence[float]) -> dict[str, float]:
     return {"mean": sum(ascending) / count, "p95": ascending[math.ceil(0.95 * count) - 1], "max": ascending[-1]}
 
 
-def measure_chain(setup: Setup, dt: float, steps: int, seconds: float, repeats: int, progress: Progress) -> dict[str, Any]:
-    """One column of Fig. 4 as plain data."""
-    given = given_steps(setup, dt, steps)
+def measure_chain(
+    setup: Setup, dt: float, steps: int, seconds: float, repeats: int, progress: Progress, engine: Engine | None = None
+) -> dict[str, Any]:
+    """One column of Fig. 4 as plain data; `engine`: of the rollout that the cases are given steps of."""
+    simulator = Simulator(setup.scene, dt, engine=engine)
+    given = given_steps(simulator, setup, steps)
     costs = measure_cases(given, seconds, repeats, progress)
     return {
+        "engine": simulator.engine,
         "dt": dt,
         "steps": steps,
         "worlds": setup.worlds,

@@ -23,13 +23,14 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from torch import Tensor
 
+from pbfd_torch.bench.stepped import stepped
 from pbfd_torch.bench.timing import Progress
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.contact.shapes import Box, Collider
 from pbfd_torch.files import write_figure
+from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
-from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import OnLagged, lm
 from pbfd_torch.stepping.stepper import Solver
 from pbfd_torch.terms.calibration import effective_mu, load_per_point, normal_force_for
@@ -57,21 +58,25 @@ NOTES = (
     f"distance: what the box covers in {DURATION:g} s, falls: throughout, as the parameter grows, least: the shortest one",
     f"moving: worlds whose box is faster than {AT_REST:g} m/s at the end",
     "error: of the distance, against a point mass that brakes with the law's own μ(v); for Coulomb's law that is v²/(2μg)",
-    "PBD, min E: the same law, each step the minimum of the energy E (Eq. 6) by LM, as PBD has it, instead of the root of r",
+    (
+        "PBD, min E: the same law, each step the minimum of the energy E (Eq. 6) by LM, as PBD has it, instead of the root of r: "
+        "in PyTorch, for the core has no such solver"
+    ),
     "trials: evaluations of r; time: of one step of one world, in a batch of all values of the parameter",
 )
 
 
 @dataclass(frozen=True)
 class Case:
-    """One law. `make`: the law for values `[worlds, 1]` of its parameter, which run from 10^`low` to 10^`high` times `unit`."""
+    """One law. `make`: the law for values `[worlds, 1]` of its parameter, which run from 10^`low` to 10^`high` times `unit`.
+    `solver`: None: the default one; with any other, steps are made in PyTorch."""
 
     title: str
     low: float
     high: float
     unit: float
     make: Callable[[Tensor], FrictionLaw]
-    solver: Solver
+    solver: Solver | None = None
 
     def values(self, count: int) -> Tensor:
         """`[count]`, in a geometric progression."""
@@ -80,11 +85,11 @@ class Case:
 
 _UNIT = float(NORMAL_FORCE.stiffness)
 CASES = {
-    "coulomb": Case("Coulomb", -1.25, 0.0, 1.0, CoulombFriction, Fallbacks()),
-    "pbd": Case("PBD", -1.0, 3.0, _UNIT, PbdFriction, Fallbacks()),
+    "coulomb": Case("Coulomb", -1.25, 0.0, 1.0, CoulombFriction),
+    "pbd": Case("PBD", -1.0, 3.0, _UNIT, PbdFriction),
     "pbd-energy": Case("PBD, min E", -1.0, 3.0, _UNIT, PbdFriction, OnLagged(lm())),
-    "pbfd-printed": Case("PBFD, printed", 1.0, 5.0, _UNIT, PbfdFriction.as_printed, Fallbacks()),
-    "pbfd-derived": Case("PBFD, derived", -1.0, 3.0, _UNIT, PbfdFriction.as_derived, Fallbacks()),
+    "pbfd-printed": Case("PBFD, printed", 1.0, 5.0, _UNIT, PbfdFriction.as_printed),
+    "pbfd-derived": Case("PBFD, derived", -1.0, 3.0, _UNIT, PbfdFriction.as_derived),
 }
 
 
@@ -123,26 +128,24 @@ def _accumulated(parts: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(parts[:, :1]), parts.cumsum(-1)), -1)
 
 
-def measure_case(case: Case, dt: float, count: int, progress: Progress) -> dict[str, Any]:
-    """One curve as plain data: distances [m] and final speeds [m/s] over the values, and what the run cost."""
+def measure_case(case: Case, dt: float, count: int, progress: Progress, engine: Engine | None = None) -> dict[str, Any]:
+    """One curve as plain data: distances [m] and final speeds [m/s] over the values, which engine made it, and what it cost."""
     values = case.values(count)
     law = case.make(values[:, None])
-    simulator = Simulator(sliding_box(law), dt, solver=case.solver)
+    simulator = Simulator(sliding_box(law), dt, solver=case.solver, engine=engine if case.solver is None else Torch())
     q, v = torch.zeros(count, 3, dtype=torch.float64), torch.zeros(count, 3, dtype=torch.float64)
     q[:, 1], v[:, 0] = HALF[2] - PENETRATION, SPEED
     state = simulator.initial_state(q, v)
-    steps, unsolved, evaluations = round(DURATION / dt), 0, 0
+    steps = round(DURATION / dt)
     started = time.perf_counter()
-    for _ in range(steps):
-        state, solution = simulator.step(state)
-        unsolved += int((~solution.solved).sum())
-        evaluations += int(solution.evaluations.sum())
+    states, solution = stepped(simulator, state, steps)
     seconds = time.perf_counter() - started
     progress(1)
-    distance, expected = state.q[:, 0], expected_distance(law, dt, count)
-    speed = simulator.integrator.velocity(simulator.scene.articulation, state, simulator.step_size)[:, 0]
+    distance, expected = states.q[-1, :, 0], expected_distance(law, dt, count)
+    speed = simulator.integrator.velocity(simulator.scene.articulation, states, simulator.step_size)[-1, :, 0]
     least = int(distance.argmin())
     return {
+        "engine": simulator.engine,
         "values": values.tolist(),
         "distance_m": distance.tolist(),
         "expected_m": expected.tolist(),
@@ -153,15 +156,15 @@ def measure_case(case: Case, dt: float, count: int, progress: Progress) -> dict[
         "error_max_m": float((distance - expected).abs().max()),
         "moving": int((speed.abs() > AT_REST).sum()),
         "steps": steps,
-        "unsolved_steps": unsolved,
-        "evaluations": evaluations / (steps * count),
+        "unsolved_steps": int((~solution.solved).sum()),
+        "evaluations": int(solution.evaluations.sum()) / (steps * count),
         "us_per_step": 1e6 * seconds / (steps * count),
     }
 
 
-def measure(time_steps: Sequence[float], count: int, progress: Progress) -> dict[str, dict[str, Any]]:
+def measure(time_steps: Sequence[float], count: int, progress: Progress, engine: Engine | None = None) -> dict[str, dict[str, Any]]:
     """All curves: case → time step, as text → curve."""
-    return {key: {f"{dt:g}": measure_case(case, dt, count, progress) for dt in time_steps} for key, case in CASES.items()}
+    return {key: {f"{dt:g}": measure_case(case, dt, count, progress, engine) for dt in time_steps} for key, case in CASES.items()}
 
 
 COLORS = ("#440154", "#31688e", "#35b779", "#e8a400", "#d62728", "#7f7f7f")

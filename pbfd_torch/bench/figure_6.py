@@ -1,7 +1,9 @@
 """Fig. 6 of the paper: what ten seconds of a chain sliding off a slope cost, against Δt, contacts in touch, and friction.
 
-Ours and the conventional stepper take the same scene from the same starts; `figure_6_peers` has MuJoCo do it. A run gives one row
-of plain data: whether it was stable, how wrong it was, and what it cost. `figure_6_claims` holds the rows against the paper.
+Ours and the conventional stepper take the same scene from the same starts; `figure_6_peers` has MuJoCo do it. The conventional
+stepper is in PyTorch, so the paper's integrator is there in PyTorch too, to compare times of like with like. A run gives one row of
+plain data: which engine made it, whether it was stable, how wrong it was, and what it cost. `figure_6_claims` holds the rows
+against the paper.
 """
 
 from __future__ import annotations
@@ -10,19 +12,20 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.balance.dynamics import center_of_mass, kinetic_energy, momentum, potential_energy
 from pbfd_torch.bench import figure_6_peers, mujoco_runs
+from pbfd_torch.bench.stepped import one_by_one, stepped
 from pbfd_torch.bench.timing import Progress, timed
 from pbfd_torch.conventional.newton_euler import NewtonEuler
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models import chains
-from pbfd_torch.native.engine import Torch
+from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
@@ -110,32 +113,56 @@ class Case:
 # Who simulates it ---------------------------------------------------------------------------------------------------------
 
 
-class Stepper(Protocol):
-    """What `Simulator` and `NewtonEuler` have in common."""
+@dataclass(frozen=True)
+class Steps:
+    """What `Simulator` and `NewtonEuler` have in common.
 
-    def initial_state(self, q: Tensor, v: Tensor) -> Any: ...
-    def step(self, state: Any) -> tuple[Any, Solution]: ...
+    Attributes:
+        engine: that makes the steps, by its name.
+        start: q `[worlds, nq]`, v `[worlds, nv]` → state.
+        made: (state, count) → the states after so many steps, and how these were solved, `[count, worlds, ...]`.
+        rates: states → pose rates Ṫ `[*, nlink, 3, 4]`, whose kinetic energy is the scheme's own: of implicit Euler over the step,
+            which is not that of a velocity at its end.
+    """
+
+    engine: str
+    start: Callable[[Tensor, Tensor], Any]
+    made: Callable[[Any, int], tuple[Any, Solution]]
+    rates: Callable[[Any], Tensor]
 
 
 @dataclass(frozen=True)
 class Formulation:
-    """A simulator of this library. `make`: (scene, Δt) → stepper and the pose rates Ṫ `[worlds, nlink, 3, 4]` of its state, whose
-    kinetic energy is the scheme's own: of implicit Euler over the step, which is not that of a velocity at its end."""
+    """A simulator of this library. `make`: (scene, Δt, engine) → its steps."""
 
     title: str
-    make: Callable[[Scene, float], tuple[Stepper, Callable[[Any], Tensor]]]
+    make: Callable[[Scene, float, Engine | None], Steps]
 
 
-def _ours(integrator: Callable[[], Any]) -> Callable[[Scene, float], tuple[Stepper, Callable[[Any], Tensor]]]:
-    def make(scene: Scene, dt: float) -> tuple[Stepper, Callable[[Any], Tensor]]:
-        simulator = Simulator(scene, dt, integrator(), engine=Torch())
-        return simulator, lambda state: simulator.integrator.pose_rates(scene.articulation, state, simulator.step_size)
+def _ours(integrator: Callable[[], Any], by: Engine | None = None) -> Callable[[Scene, float, Engine | None], Steps]:
+    """`by`: an engine whatever is asked for."""
+
+    def make(scene: Scene, dt: float, engine: Engine | None) -> Steps:
+        simulator = Simulator(scene, dt, integrator(), engine=by or engine)
+        return Steps(
+            simulator.engine,
+            simulator.initial_state,
+            lambda state, count: stepped(simulator, state, count),
+            lambda states: simulator.integrator.pose_rates(scene.articulation, states, simulator.step_size),
+        )
 
     return make
 
 
-def _newton_euler(scene: Scene, dt: float) -> tuple[Stepper, Callable[[Any], Tensor]]:
-    return NewtonEuler(scene, dt), lambda state: pose_rates(scene, state.q, state.v)
+def _newton_euler(scene: Scene, dt: float, engine: Engine | None) -> Steps:
+    """In PyTorch always."""
+    stepper = NewtonEuler(scene, dt)
+    return Steps(
+        Torch.name,
+        stepper.initial_state,
+        lambda state, count: one_by_one(stepper.step, state, count),
+        lambda states: pose_rates(scene, states.q, states.v),
+    )
 
 
 def pose_rates(scene: Scene, q: Tensor, v: Tensor) -> Tensor:
@@ -143,12 +170,15 @@ def pose_rates(scene: Scene, q: Tensor, v: Tensor) -> Tensor:
     return Motion(place(scene.articulation, q), v).rates
 
 
+EAGER = "implicit-euler-torch"
 FORMULATIONS = {
     "implicit-euler": Formulation("ours, Euler", _ours(ImplicitEuler)),
+    EAGER: Formulation("ours, Euler, PyTorch", _ours(ImplicitEuler, Torch())),
     "energy-momentum": Formulation("ours, energy–mom.", _ours(EnergyMomentum)),
     "conventional": Formulation("Newton–Euler", _newton_euler),
 }
-OURS = ("implicit-euler", "energy-momentum")
+OURS = ("implicit-euler", EAGER, "energy-momentum")
+IN_B_ALONE = (EAGER, "energy-momentum")  # not in panels (c) and (d)
 TITLES = {key: x.title for key, x in FORMULATIONS.items()} | {key: x.title for key, x in figure_6_peers.PEERS.items()}
 # in panel (b), how many times as many steps as others: cheap ones, whose stability is to be seen
 REACH = {"conventional": 4, **dict.fromkeys(figure_6_peers.PEERS, 10_000)}
@@ -197,53 +227,43 @@ QUICK = Effort(
 # One run ------------------------------------------------------------------------------------------------------------------
 
 
-def measure_run(simulator: str, case: Case, worlds: int = 0, batch_steps: int = 1, repeats: int = 1) -> Row:
-    """One row. worlds > 1: a batch of them is timed too, for `batch_steps`; `repeats` as in `Effort`. Times: wall ms per simulated
-    second and world."""
+def measure_run(
+    simulator: str, case: Case, worlds: int = 0, batch_steps: int = 1, repeats: int = 1, engine: Engine | None = None
+) -> Row:
+    """One row. worlds > 1: a batch of them is timed too, for `batch_steps`; `repeats` as in `Effort`; engine: of ours. Times: wall
+    ms per simulated second and world."""
     (q, v), scene = STARTS[case.start].state(), case.scene()
-    row = {"simulator": simulator, **dataclasses.asdict(case), "simulated_s": case.steps * case.dt}
+    row = {"simulator": simulator, "engine": mujoco_runs.ENGINE, **dataclasses.asdict(case), "simulated_s": case.steps * case.dt}
     if simulator not in FORMULATIONS:
         ran = figure_6_peers.run(simulator, q[0], v[0], case.dt, case.steps, case.points, case.mu, repeats)
         seen = observed(case, ran.q[:, None], pose_rates(scene, ran.q, ran.v)[:, None])
         time = {"1": 1e3 * ran.seconds / row["simulated_s"]} if seen["finite"] else {}
         return {**row, **seen, "unsolved_steps": 0, "evaluations": math.nan, "ms_per_s": time}
-    stepper, rates = FORMULATIONS[simulator].make(scene, case.dt)
-    start = stepper.initial_state(q, v)
-
-    def call() -> tuple[list[Any], list[Solution]]:
-        states, solutions = [start], []
-        for _ in range(case.steps):
-            state, solution = stepper.step(states[-1])
-            states.append(state)
-            solutions.append(solution)
-        return states, solutions
-
-    (states, solutions), seconds = timed(lambda: call, repeats, enough_s=0.3)
-    moving = torch.stack([pose_rates(scene, q, v), *map(rates, states[1:])])
-    seen = observed(case, torch.stack([state.q for state in states]), moving)
+    steps = FORMULATIONS[simulator].make(scene, case.dt, engine)
+    start = steps.start(q, v)
+    (states, solution), seconds = timed(lambda: lambda: steps.made(start, case.steps), repeats, enough_s=0.3)
+    moving = torch.cat((pose_rates(scene, q, v)[None], steps.rates(states)))
+    seen = observed(case, torch.cat((q[None], states.q)), moving)
     time = {"1": 1e3 * seconds / row["simulated_s"]} if seen["finite"] else {}
     if worlds > 1 and seen["stable"]:
-        time[str(worlds)] = _batch_time(stepper, states[:-1], worlds, batch_steps, repeats) / case.dt
+        begun = mapped(lambda first, rest: torch.cat((first[None], rest[:-1])), start, states)
+        time[str(worlds)] = _batch_time(steps, begun, worlds, batch_steps, repeats) / case.dt
     return {
         **row,
         **seen,
-        "unsolved_steps": sum(int((~solution.solved).sum()) for solution in solutions),
-        "evaluations": sum(int(solution.evaluations.sum()) for solution in solutions) / case.steps,
+        "engine": steps.engine,
+        "unsolved_steps": int((~solution.solved).sum()),
+        "evaluations": int(solution.evaluations.sum()) / case.steps,
         "ms_per_s": time,
     }
 
 
-def _batch_time(stepper: Stepper, states: Sequence[Any], worlds: int, steps: int, repeats: int) -> float:
-    """[ms] of one step of one world in a batch, whose worlds start all along a trajectory: so few steps tell what it costs."""
-    spread = [states[k * len(states) // worlds] for k in range(worlds)]
-    start = mapped(lambda *parts: torch.cat(parts), *spread)
-
-    def call() -> None:
-        state = start
-        for _ in range(steps):
-            state, _ = stepper.step(state)
-
-    return 1e3 * timed(lambda: call, repeats, enough_s=0.3)[1] / steps / worlds
+def _batch_time(steps: Steps, states: Any, worlds: int, count: int, repeats: int) -> float:
+    """[ms] of one step of one world in a batch, whose worlds start all along a trajectory `[T, 1, ...]`: so few steps tell what it
+    costs."""
+    rows = torch.arange(worlds) * len(states.q) // worlds
+    start = mapped(lambda x: x[rows, 0], states)
+    return 1e3 * timed(lambda: lambda: steps.made(start, count), repeats, enough_s=0.3)[1] / count / worlds
 
 
 def observed(case: Case, q: Tensor, rates: Tensor) -> Row:
@@ -284,32 +304,29 @@ def best_step(rows: Sequence[Row], simulator: str, start: str) -> float | None:
     return max((row["dt"] for row in own if row["dt"] < unstable), default=None)
 
 
-def measure(effort: Effort, progress: Progress) -> dict[str, Any]:
-    """The three panels as plain data: rows of (b) `time_steps`, (c) `contacts`, (d) `friction`, both of the start `SCENE`;
-    `best_dt`: start → simulator → Δt, `own_dt` what (c) and (d) take for it; and a `picture` of the scene. Without MuJoCo, its rows
-    are missing. Energy–momentum is in (b) alone."""
-    peers = list(figure_6_peers.PEERS) if mujoco_runs.version() else []
+def measure(effort: Effort, progress: Progress, engine: Engine | None = None) -> dict[str, Any]:
+    """The three panels as plain data, ours by an engine: rows of (b) `time_steps`, (c) `contacts`, (d) `friction`, both of the
+    start `SCENE`; `best_dt`: start → simulator → Δt, `own_dt` what (c) and (d) take for it; and a `picture` of the scene. Without
+    MuJoCo, its rows are missing. Those of `IN_B_ALONE` are not in (c) and (d)."""
+    simulators = _simulators(engine)
     steps = []
-    for simulator, start, dt in [(x, y, z) for y in effort.starts for x in [*FORMULATIONS, *peers] for z in effort.time_steps]:
-        steps.append(
-            measure_run(
-                simulator, effort.case(start, dt, REACH.get(simulator, 1)), effort.worlds, effort.batch_steps, effort.repeats
-            )
-        )
+    for simulator, start, dt in [(x, y, z) for y in effort.starts for x in simulators for z in effort.time_steps]:
+        case = effort.case(start, dt, REACH.get(simulator, 1))
+        steps.append(measure_run(simulator, case, effort.worlds, effort.batch_steps, effort.repeats, engine))
         progress(1)
-    best = {start: {key: best_step(steps, key, start) for key in (*FORMULATIONS, *peers)} for start in effort.starts}
-    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key != "energy-momentum"}
+    best = {start: {key: best_step(steps, key, start) for key in simulators} for start in effort.starts}
+    own = {key: dt or min(effort.time_steps) for key, dt in best[SCENE].items() if key not in IN_B_ALONE}
     contacts = []
     for simulator, points in [(x, y) for x in own for y in effort.points]:
         for dt in sorted({own[simulator], COMMON_STEP}):
             case = effort.case(SCENE, dt, points=points)
-            contacts.append(measure_run(simulator, case, effort.worlds, effort.batch_steps, effort.repeats))
+            contacts.append(measure_run(simulator, case, effort.worlds, effort.batch_steps, effort.repeats, engine))
         progress(1)
     frictions = []
     for simulator, law in [*((key, "Coulomb") for key in own), ("implicit-euler", "PBFD")]:
         for mu in effort.frictions:
             case = effort.case(SCENE, own[simulator], mu=mu, law=law)
-            frictions.append(measure_run(simulator, case, repeats=effort.repeats))
+            frictions.append(measure_run(simulator, case, repeats=effort.repeats, engine=engine))
             progress(1)
     return {
         "time_steps": steps,
@@ -317,29 +334,34 @@ def measure(effort: Effort, progress: Progress) -> dict[str, Any]:
         "friction": frictions,
         "best_dt": best,
         "own_dt": own,
-        "picture": list(snapshots()),
+        "picture": list(snapshots(engine)),
     }
 
 
-def units(effort: Effort) -> int:
+def _simulators(engine: Engine | None) -> list[str]:
+    """Those that can be run; ours in PyTorch is not run twice."""
+    ours = [key for key in FORMULATIONS if not (key == EAGER and engine == Torch())]
+    return [*ours, *(figure_6_peers.PEERS if mujoco_runs.version() else ())]
+
+
+def units(effort: Effort, engine: Engine | None = None) -> int:
     """What `measure` tells its progress in all."""
-    peers = len(figure_6_peers.PEERS) if mujoco_runs.version() else 0
-    refined = len(FORMULATIONS) - 1 + peers
-    steps = len(effort.starts) * len(effort.time_steps) * (len(FORMULATIONS) + peers)
+    simulators = _simulators(engine)
+    refined = sum(key not in IN_B_ALONE for key in simulators)
+    steps = len(effort.starts) * len(effort.time_steps) * len(simulators)
     return steps + refined * len(effort.points) + (refined + 1) * len(effort.frictions)
 
 
-def snapshots(dt: float = 0.02, every: int = 10, count: int = 7) -> Iterator[Row]:
+def snapshots(engine: Engine | None = None, dt: float = 0.02, every: int = 10, count: int = 7) -> Iterator[Row]:
     """The dropped chain every so many steps: x and z [m] of its links' ends, gravity along −z."""
     case = Case(SCENE, dt, every * count)
     scene = case.scene()
-    stepper, _ = FORMULATIONS["implicit-euler"].make(scene, dt)
-    state = stepper.initial_state(*STARTS[case.start].state())
-    for k in range(case.steps):
-        if k % every == 0:
-            poses = place(scene.articulation, state.q).poses[0, :, :3]
-            ends = torch.cat((poses[..., 3], poses[-1:, :, 3] + chains.LENGTH * poses[-1:, :, 0]))
-            x, z = ends[:, 0], ends[:, 2]
-            sine, cosine = math.sin(chains.SLOPE), math.cos(chains.SLOPE)
-            yield {"time_s": k * dt, "x_m": (cosine * x + sine * z).tolist(), "z_m": (cosine * z - sine * x).tolist()}
-        state, _ = stepper.step(state)
+    steps = FORMULATIONS["implicit-euler"].make(scene, dt, engine)
+    start = steps.start(*STARTS[case.start].state())
+    path = torch.cat((start.q[None], steps.made(start, case.steps)[0].q))
+    for k in range(0, case.steps, every):
+        poses = place(scene.articulation, path[k]).poses[0, :, :3]
+        ends = torch.cat((poses[..., 3], poses[-1:, :, 3] + chains.LENGTH * poses[-1:, :, 0]))
+        x, z = ends[:, 0], ends[:, 2]
+        sine, cosine = math.sin(chains.SLOPE), math.cos(chains.SLOPE)
+        yield {"time_s": k * dt, "x_m": (cosine * x + sine * z).tolist(), "z_m": (cosine * z - sine * x).tolist()}

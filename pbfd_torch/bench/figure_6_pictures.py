@@ -21,6 +21,7 @@ from pbfd_torch.models import chains
 
 STYLES: Mapping[str, dict[str, Any]] = {
     "implicit-euler": {"color": "#440154", "marker": "o"},
+    "implicit-euler-torch": {"color": "#440154", "marker": "o", "markerfacecolor": "white", "alpha": 0.5},
     "energy-momentum": {"color": "#35b779", "marker": "o"},
     "conventional": {"color": "#d62728", "marker": "s"},
     "mujoco-implicitfast": {"color": "0.4", "marker": "^"},

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from pbfd_torch.bench import cases_chains, cases_contact, cases_free_motion, cases_friction, cases_stacks
 from pbfd_torch.bench.hard_cases_case import Case, Check, Run
+from pbfd_torch.native.engine import Engine
 from pbfd_torch.solvers.objective import Status
 
 GROUPS = (cases_free_motion, cases_chains, cases_friction, cases_contact, cases_stacks)
@@ -32,6 +33,7 @@ class Result:
         checks: what was measured.
         steps, unsolved: world-steps, and those of them that nothing solved.
         fallbacks: world-steps that ended with each of `FALLBACKS`, by its name.
+        engine: what made the steps: native, torch, or both.
         wall_s: [s].
     """
 
@@ -42,6 +44,7 @@ class Result:
     steps: int
     unsolved: int
     fallbacks: Mapping[str, int]
+    engine: str
     wall_s: float
 
     @property
@@ -54,10 +57,12 @@ class Result:
         return dataclasses.asdict(self) | {"checks": checks}
 
 
-def plan(names: Iterable[str], integrators: Sequence[str], steps: Sequence[float], quick: bool) -> list[tuple[Case, Run]]:
-    """The runs of some cases that are tried with these integrators and at these steps."""
+def plan(
+    names: Iterable[str], integrators: Sequence[str], steps: Sequence[float], quick: bool, engine: Engine | None = None
+) -> list[tuple[Case, Run]]:
+    """The runs of some cases that are tried with these integrators and at these steps, by an engine."""
     return [
-        (case, Run(integrator, dt, quick))
+        (case, Run(integrator, dt, quick, engine))
         for case in (CASES[name] for name in names)
         for integrator in integrators
         if integrator in case.integrators
@@ -80,5 +85,6 @@ def measure(case: Case, run: Run) -> Result:
         steps=sum(x.numel() for x in status),
         unsolved=sum(int((x > int(Status.HALVED)).sum()) for x in status),
         fallbacks={kind.name.lower(): sum(int((x == int(kind)).sum()) for x in status) for kind in FALLBACKS},
+        engine=" and ".join(sorted(run.engines)),
         wall_s=wall,
     )

@@ -11,9 +11,11 @@ from torch import Tensor
 
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.models.setup import Setup
+from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
+from pbfd_torch.stepping.stepper import Solver
 
 ALL = tuple(INTEGRATORS)
 FIRST_ORDER = ("implicit-euler",)
@@ -70,12 +72,16 @@ class Run:
         integrator: its name.
         dt: step [s].
         brief: whether long simulations are cut short.
+        engine: what makes the steps; None: the core where it can.
+        engines: the names of those that have made them.
     """
 
     integrator: str
     dt: float
     brief: bool = False
+    engine: Engine | None = None
     rollouts: list[Rollout] = field(default_factory=list)
+    engines: set[str] = field(default_factory=set)
 
     def among(self, names: Collection[str], largest: float = math.inf) -> bool:
         """Whether the integrator is one of these and the step at most `largest` [s]."""
@@ -85,9 +91,12 @@ class Run:
         """How long to simulate [s]."""
         return brief if self.brief else full
 
-    def simulator(self, scene: Scene, parts: int = 1) -> Simulator:
-        """Of the scene, with steps of dt/parts."""
-        return Simulator(scene, self.dt / parts, INTEGRATORS[self.integrator]())
+    def simulator(self, scene: Scene, parts: int = 1, solver: Solver | None = None) -> Simulator:
+        """Of the scene, with steps of dt/parts; those of a solver that is not the default one are made in PyTorch."""
+        engine = self.engine if solver is None else Torch()
+        made = Simulator(scene, self.dt / parts, INTEGRATORS[self.integrator](), solver, engine=engine)
+        self.engines.add(made.engine)
+        return made
 
     def roll(
         self, scene: Scene, duration: float, q: Tensor | None = None, v: Tensor | None = None, parts: int = 1,

@@ -16,6 +16,7 @@ from pbfd_torch.bench.mujoco_scenes import ROBOTS, mjcf
 from pbfd_torch.bench.timing import timed
 
 INTEGRATORS = ("Euler", "implicitfast", "RK4")
+ENGINE = "mujoco"  # beside our own engines' names
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_INERTIA")
 
 

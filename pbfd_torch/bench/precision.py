@@ -18,22 +18,25 @@ from torch import Tensor
 from pbfd_torch.bench import mujoco_runs
 from pbfd_torch.bench.precision_scenes import CASES, FRAME, Case
 from pbfd_torch.bench.precision_tracks import Track
-from pbfd_torch.bench.timing import Progress
+from pbfd_torch.bench.stepped import stepped
+from pbfd_torch.bench.timing import Progress, timed
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
-from pbfd_torch.native.engine import Torch
+from pbfd_torch.native.engine import Engine
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 
 OURS, PEER, ADAPTIVE = "pbfd_torch", "MuJoCo", "adaptive"
 OWN, OWN_PEER = "energy-momentum", "RK4"  # the integrators that are references, each of its own simulator
+MOST_CALLS = 100  # of the core, to take the shortest
 SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
 NOTES = (
     "error: root mean square of the distance from the reference over what is observed; Δt: held to it, but for `adaptive`",
     (
-        "time of ours: bare steps; each world of a batch starts from another time of the motion, spread evenly over it, so that "
-        "the worlds are in different phases and wait for the slowest; a single world is timed from several such times (box: μ = .1)"
+        "time of ours: bare steps, which the core makes many of in one call; each world of a batch starts from another time of the "
+        "motion, spread evenly over it; a single world is timed from several such times (box: μ = .1)"
     ),
     (
         "adaptive: energy–momentum steps of every world's own choice for an accuracy, Δt: their mean; time: of the whole recorded "
@@ -99,12 +102,13 @@ QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 0.005, 0.0005, 8, (0.1, 0.1), 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A recorded motion of one of our integrators."""
+    """A recorded motion of one of our integrators, by one of our engines."""
 
     integrator: str
     dt: float
     track: Track
     rollout: Rollout
+    engine: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,15 +125,15 @@ def step_count(duration: float, dt: float) -> int:
     return round(duration / dt)
 
 
-def our_motion(case: Case, integrator: str, dt: float, duration: float) -> Motion:
+def our_motion(case: Case, integrator: str, dt: float, duration: float, engine: Engine | None = None) -> Motion:
     """From the scene's start, recorded."""
     setup = case.setup(case.tracked_worlds)
-    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator](), engine=Torch())
+    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator](), engine=engine)
     steps = step_count(duration, dt)
     controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
     rollout = simulator.rollout(start, controls, steps if controls is None else None)
-    return Motion(integrator, dt, Track.of_rollout(setup, rollout), rollout)
+    return Motion(integrator, dt, Track.of_rollout(setup, rollout), rollout, simulator.engine)
 
 
 def peer_motion(case: Case, integrator: str, dt: float, duration: float, repeats: int = 1) -> tuple[Track, float, bool]:
@@ -157,10 +161,10 @@ def starts(track: Track, worlds: int, first: int, count: int) -> tuple[Tensor, T
     return track.q[row, copy], track.v[row, copy], track.time[row]
 
 
-def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: int) -> float:
+def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: int, engine: Engine | None = None) -> float:
     """Wall time per simulated second and world [ms]."""
     setup = case.setup(worlds)
-    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator](), engine=Torch())
+    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator](), engine=engine)
     groups = pieces if worlds == 1 else 1
     span = max(2, motion.rollout.steps // pieces)
     each = []
@@ -170,16 +174,25 @@ def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: in
         fresh, began = simulator.initial_state(q, v, controls[0]), time.perf_counter()
         # the first step does not count: a velocity that is an average over the last one makes it harder than others
         start, _ = simulator.step(fresh, controls[0])
-        if (first := time.perf_counter() - began) > SLOW * seconds / groups:
-            each.append(first)
-            continue
-        state, count, began = start, 0, time.perf_counter()
-        while count < 2 or time.perf_counter() - began < seconds / groups:
-            state = start if count % span == 0 else state
-            state, _ = simulator.step(state, controls[1 + count % span])
-            count += 1
-        each.append((time.perf_counter() - began) / count)
+        first = time.perf_counter() - began
+        slow = first > SLOW * seconds / groups
+        each.append(first if slow else _step_time(simulator, start, controls[1:], seconds / groups))
     return 1e3 * sum(each) / groups / motion.dt / worlds
+
+
+def _step_time(simulator: Simulator[Any], start: Any, controls: Sequence[Tensor | None], seconds: float) -> float:
+    """Wall time of a step [s] over the steps under these controls, as far as `seconds` reach, or as often: of the core, which makes
+    them all in one call, the shortest."""
+    span, given = len(controls), [x for x in controls if x is not None]
+    if isinstance(simulator.stepper, NativeStepper):
+        held = torch.stack(given) if given else None
+        return timed(lambda: lambda: stepped(simulator, start, span, held), MOST_CALLS, enough_s=seconds)[1] / span
+    state, count, began = start, 0, time.perf_counter()
+    while count < 2 or time.perf_counter() - began < seconds:
+        state = start if count % span == 0 else state
+        state, _ = simulator.step(state, controls[count % span])
+        count += 1
+    return (time.perf_counter() - began) / count
 
 
 def reference_of(case: Case, integrator: str, dt: float, motion: Callable[[float, float], Track]) -> Reference:
@@ -192,9 +205,9 @@ def reference_of(case: Case, integrator: str, dt: float, motion: Callable[[float
     return Reference(value, case.error(motion(2 * dt, until), value), f"{integrator} at {dt:g} s")
 
 
-def our_reference(case: Case, dt: float) -> Reference:
+def our_reference(case: Case, dt: float, engine: Engine | None = None) -> Reference:
     """The default integrator's at dt."""
-    return reference_of(case, OWN, dt, lambda *args: our_motion(case, OWN, *args).track)
+    return reference_of(case, OWN, dt, lambda step, until: our_motion(case, OWN, step, until, engine).track)
 
 
 def peer_reference(case: Case, dt: float) -> Reference:
@@ -202,26 +215,29 @@ def peer_reference(case: Case, dt: float) -> Reference:
     return reference_of(case, OWN_PEER, dt, lambda *args: peer_motion(case, OWN_PEER, *args)[0])
 
 
-def our_row(case: Case, motion: Motion, reference: Reference, other: Reference | None, effort: Effort) -> dict[str, Any]:
+def our_row(
+    case: Case, motion: Motion, reference: Reference, other: Reference | None, effort: Effort, engine: Engine | None = None
+) -> dict[str, Any]:
     """One time step of one integrator as plain data; other: MuJoCo's reference, where it has its own."""
     rollout = motion.rollout
     away = {} if other is None or case.exact is not None else {"error_to_mujoco": case.error(motion.track, other.value)}
-    batches = dict(zip((1, effort.worlds), effort.seconds, strict=True))
+    batches = zip((1, effort.worlds), effort.seconds, strict=True)
     return {
         **_ours(case, motion.track, rollout, reference),
+        "engine": motion.engine,
         "integrator": motion.integrator,
         "dt": motion.dt,
         "world_steps": rollout.status.numel(),
-        "ms_per_s": {str(worlds): our_cost(case, motion, worlds, seconds, effort.pieces) for worlds, seconds in batches.items()},
+        "ms_per_s": {str(worlds): our_cost(case, motion, worlds, seconds, effort.pieces, engine) for worlds, seconds in batches},
         **_told(case, motion.track),
         **away,
     }
 
 
-def adaptive_row(case: Case, accuracy: float, reference: Reference) -> dict[str, Any]:
+def adaptive_row(case: Case, accuracy: float, reference: Reference, engine: Engine | None = None) -> dict[str, Any]:
     """One run with steps of the worlds' own."""
     setup = case.setup(case.tracked_worlds)
-    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, FRAME, accuracy)
+    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, FRAME, accuracy, engine=engine)
     frames = step_count(case.duration, FRAME)
     controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
@@ -232,6 +248,7 @@ def adaptive_row(case: Case, accuracy: float, reference: Reference) -> dict[str,
     steps = int(rollout.substeps.sum())
     return {
         **_ours(case, track, rollout, reference),
+        "engine": simulator.engine,
         "integrator": ADAPTIVE,
         "dt": case.duration * setup.worlds / steps,
         "accuracy_m": accuracy,
@@ -246,6 +263,7 @@ def peer_row(case: Case, integrator: str, dt: float, reference: Reference, repea
     track, seconds, diverged = peer_motion(case, integrator, dt, case.duration, repeats)
     return {
         "simulator": PEER,
+        "engine": mujoco_runs.ENGINE,
         "integrator": integrator,
         "dt": dt,
         "error": case.error(track, reference.value),
@@ -275,22 +293,22 @@ def _told(case: Case, track: Track) -> dict[str, float]:
 
 
 def measure_scene(
-    case: Case, integrators: Sequence[str], peers: Sequence[str], effort: Effort, progress: Progress
+    case: Case, integrators: Sequence[str], peers: Sequence[str], effort: Effort, progress: Progress, engine: Engine | None = None
 ) -> dict[str, Any]:
-    """All rows of one scene as plain data. peers: MuJoCo's integrators; none: without MuJoCo."""
+    """All rows of one scene as plain data. peers: MuJoCo's integrators; none: without MuJoCo. engine: of our steps."""
     motions = []
     for name in integrators:
         for dt in effort.steps_of(case):
-            motions.append(our_motion(case, name, dt, case.duration))
+            motions.append(our_motion(case, name, dt, case.duration, engine))
             progress(1)
-    reference = our_reference(case, effort.own_step)
+    reference = our_reference(case, effort.own_step, engine)
     other = peer_reference(case, effort.own_peer_step) if peers else None
     rows = []
     for motion in motions:
-        rows.append(our_row(case, motion, reference, other, effort))
+        rows.append(our_row(case, motion, reference, other, effort, engine))
         progress(1)
     for accuracy in effort.accuracies_with(integrators):
-        rows.append(adaptive_row(case, accuracy, reference))
+        rows.append(adaptive_row(case, accuracy, reference, engine))
         progress(1)
     if other is not None:
         for name in peers:

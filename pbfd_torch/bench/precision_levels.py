@@ -105,7 +105,10 @@ def _own_text(scene: Mapping[str, Any]) -> str:
 
 def _cells(row: Row, scene: Mapping[str, Any]) -> list[str]:
     batch = batch_of(scene)
-    known = {"simulator", "integrator", "dt", "error", "diverged", "world_steps", "unsolved_steps", "fallbacks", "ms_per_s"}
+    known = {
+        *("simulator", "engine", "integrator", "dt", "error", "diverged"),
+        *("world_steps", "unsolved_steps", "fallbacks", "ms_per_s"),
+    }
     also = ", ".join(f"{name} {value:.2g}" for name, value in row.items() if name not in known and math.isfinite(value))
     ours = row["simulator"] == OURS
     times = row["ms_per_s"]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pbfd_torch.bench.random_robots import RandomRobot
 from pbfd_torch.integrators.energy_momentum import NOISE, EnergyMomentum, Velocities
+from pbfd_torch.native.engine import Engine
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.stepping.eager import MOST_EVALUATIONS
@@ -26,7 +27,7 @@ class Soak:
     """What has happened so far.
 
     Attributes:
-        seeds: robots; world_steps: steps of single worlds.
+        seeds: robots; world_steps: steps of single worlds; engines: how many robots each engine has stepped, by its name.
         status: how many of these ended with each `Status`.
         not_finite_unsaid: states with NaN or infinity that no status tells of.
         energy_rises: steps after which all together have gained more than the integrator's account allows.
@@ -40,6 +41,7 @@ class Soak:
 
     seeds: int = 0
     world_steps: int = 0
+    engines: dict[str, int] = field(default_factory=dict)
     status: dict[str, int] = field(default_factory=lambda: dict.fromkeys((x.name for x in Status), 0))
     not_finite_unsaid: int = 0
     energy_rises: int = 0
@@ -90,13 +92,13 @@ class Soak:
         return {**vars(self), "unsolved": self.unsolved, "memory_growth": growth}
 
 
-def soak(world_steps: int, seed: int, dt: float, progress: Callable[[int], object]) -> Soak:
-    """Robots from this seed on, until so many steps of single worlds are made; progress: called with those of every step. An
-    interruption ends it early, and keeps what was counted."""
+def soak(world_steps: int, seed: int, dt: float, progress: Callable[[int], object], engine: Engine | None = None) -> Soak:
+    """Robots from this seed on, until an engine has made so many steps of single worlds; progress: called with those of every step.
+    An interruption ends it early, and keeps what was counted."""
     found = Soak()
     try:
         while found.world_steps < world_steps:
-            _robot(found, seed + found.seeds, dt, world_steps, progress)
+            _robot(found, seed + found.seeds, dt, world_steps, progress, engine)
             found.seeds += 1
     except KeyboardInterrupt:
         pass
@@ -104,10 +106,11 @@ def soak(world_steps: int, seed: int, dt: float, progress: Callable[[int], objec
     return found
 
 
-def _robot(found: Soak, seed: int, dt: float, world_steps: int, progress: Callable[[int], object]) -> None:
+def _robot(found: Soak, seed: int, dt: float, world_steps: int, progress: Callable[[int], object], engine: Engine | None) -> None:
     """One robot, for as many steps as are left to it."""
     robot = RandomRobot(seed)
-    simulator = Simulator(robot.pushed(WORLDS), dt, EnergyMomentum())
+    simulator = Simulator(robot.pushed(WORLDS), dt, EnergyMomentum(), engine=engine)
+    found.engines[simulator.engine] = found.engines.get(simulator.engine, 0) + 1
     state = simulator.initial_state(*robot.start(WORLDS))
     for step in range(STEPS):
         if found.world_steps >= world_steps:

@@ -15,7 +15,6 @@ from pbfd_torch.bench.timing import Progress, exponent, fit_sizes, timed, worst
 from pbfd_torch.contact.half_space import HalfSpace
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.models.chains import GRAVITY, RADIUS, STIFFNESS, chain_colliders, chain_links
-from pbfd_torch.native.engine import Torch
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.directions import Direction, GaussNewtonLm, JtjLm, Lm, Model, Newton, times
@@ -126,7 +125,7 @@ class Problem:
             ground = HalfSpace(offset=-RADIUS)
             terms.append(Contact.between(a, chain_colliders(n), ground, NormalForce(STIFFNESS), CoulombFriction(0.5)))
         scheme = ImplicitEuler()
-        simulator = Simulator(Scene(a, terms, a.rest.new_tensor([0.0, 0.0, -GRAVITY])), DT, scheme, engine=Torch())
+        simulator = Simulator(Scene(a, terms, a.rest.new_tensor([0.0, 0.0, -GRAVITY])), DT, scheme)
         generator = torch.Generator().manual_seed(0)
         bent, moved = (torch.randn(worlds, n, generator=generator, dtype=a.dtype) for _ in range(2))
         # bends add up along the chain: this keeps the tip's height within some tenths of a millimetre for every n

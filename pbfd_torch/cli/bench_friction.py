@@ -13,9 +13,10 @@ import typer
 from rich.console import Console
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
-from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, three_digits, write_files
+from pbfd_torch.cli.options import EngineChoice, EngineOption, use_threads
 from pbfd_torch.cli.outputs import check_folder
+from pbfd_torch.native.engine import Engine
 
 FILES = ("friction.json", "fig5.png")
 VALUES, QUICK_VALUES = 21, 9
@@ -24,6 +25,7 @@ VALUES, QUICK_VALUES = 21, 9
 def friction(
     out: Annotated[Path, typer.Option(help=f"Folder for {' and '.join(FILES)}.")] = Path("bench-friction"),
     quick: Annotated[bool, typer.Option("--quick", help="Two time steps and fewer values of each parameter.")] = False,
+    engine: EngineOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Slides a box to rest under Coulomb's law, PBD and PBFD: distance against μ or C∥ at several time steps (Fig. 5). One thread,
@@ -32,7 +34,8 @@ def friction(
 
     check_folder(out, FILES)
     use_threads(1)
-    report = measured(QUICK_TIME_STEPS, QUICK_VALUES) if quick else measured(TIME_STEPS, VALUES)
+    steps, count = (QUICK_TIME_STEPS, QUICK_VALUES) if quick else (TIME_STEPS, VALUES)
+    report = measured(steps, count, EngineChoice.engine(engine))
     write(report, out)
     if as_json:
         print(json.dumps(plain(report), allow_nan=False))
@@ -41,14 +44,15 @@ def friction(
     raise typer.Exit(min(1, sum(curve["unsolved_steps"] for case in report["curves"].values() for curve in case.values())))
 
 
-def measured(time_steps: Sequence[float], count: int) -> dict[str, Any]:
+def measured(time_steps: Sequence[float], count: int, engine: Engine | None) -> dict[str, Any]:
     """All curves with `count` values each, as plain data; with a progress bar on a terminal."""
-    from pbfd_torch.bench import figure_5
+    from pbfd_torch.bench import engines, figure_5
 
     started = time.perf_counter()
     total = len(figure_5.CASES) * len(time_steps)
     with tqdm(total=total, unit="curve", disable=not sys.stderr.isatty(), leave=False) as bar:
-        curves = figure_5.measure(time_steps, count, bar.update)
+        curves = figure_5.measure(time_steps, count, bar.update, engine)
+    made = [(figure_5.CASES[key].title, curve["engine"]) for key, case in curves.items() for curve in case.values()]
     return {
         "wall_s": time.perf_counter() - started,
         "environment": environment(),
@@ -56,7 +60,7 @@ def measured(time_steps: Sequence[float], count: int) -> dict[str, Any]:
         "duration_s": figure_5.DURATION,
         "normal_stiffness": float(figure_5.NORMAL_FORCE.stiffness),
         "curves": curves,
-        "notes": list(figure_5.NOTES),
+        "notes": [*figure_5.NOTES, engines.in_words(made)],
     }
 
 
@@ -90,7 +94,7 @@ def print_report(report: dict[str, Any], folder: Path) -> None:
                 *(f"{curve['least_m']:.4f}", f"{curve['least_at']:.2g}"),
                 *(f"{curve['moving']}/{worlds}", f"{1e3 * curve['error_max_m']:.3g}"),
                 *(f"{curve['unsolved_steps']}/{curve['steps'] * worlds}", f"{curve['evaluations']:.2f}"),
-                f"{curve['us_per_step']:.0f}",
+                three_digits(curve["us_per_step"]),
             )
     console.print(result, "", sep="\n")
     for note in report["notes"]:

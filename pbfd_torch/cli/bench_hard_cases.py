@@ -14,7 +14,7 @@ from rich.console import Console
 from tqdm import tqdm
 
 from pbfd_torch.cli.benchmarks import chosen, environment, new_table, plain, write_files
-from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.options import EngineChoice, EngineOption, use_threads
 from pbfd_torch.cli.outputs import check_folder
 from pbfd_torch.errors import InputError
 from pbfd_torch.files import write_whole
@@ -33,6 +33,7 @@ def hard_cases(
     dt: Annotated[str, typer.Option(help="Time steps in seconds, separated by commas; default: all that each case allows.")] = "",
     out: Annotated[Path, typer.Option(help=f"Folder for {' and '.join(FILES)}.")] = Path("bench-hard-cases"),
     quick: Annotated[bool, typer.Option("--quick", help="One or two time steps a case, and shorter simulations.")] = False,
+    engine: EngineOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
     """Holds every integrator to closed forms, conservation laws and limits in free motion, friction, contact and stacks, at each
@@ -42,7 +43,8 @@ def hard_cases(
 
     by_text = {f"{step:g}": step for step in TIME_STEPS}
     steps = [by_text[text] for text in chosen("--dt", dt, by_text, _as_seconds)]
-    runs = plan(chosen("--cases", cases, CASES), chosen("--integrators", integrators, INTEGRATORS), steps, quick)
+    names, schemes = chosen("--cases", cases, CASES), chosen("--integrators", integrators, INTEGRATORS)
+    runs = plan(names, schemes, steps, quick, EngineChoice.engine(engine))
     if not runs:
         raise InputError(f"no case is tried so: --cases '{cases}', --integrators '{integrators}', --dt '{dt}'; leave one out")
     check_folder(out, FILES)
@@ -66,6 +68,7 @@ def _as_seconds(text: str) -> str:
 
 def measured(runs: Sequence[tuple[Case, Run]], quick: bool) -> tuple[list[Result], dict[str, Any]]:
     """The results, and everything as plain data; with a progress bar on a terminal."""
+    from pbfd_torch.bench import engines
     from pbfd_torch.bench.hard_cases import NOTES, measure
 
     started = time.perf_counter()
@@ -84,7 +87,7 @@ def measured(runs: Sequence[tuple[Case, Run]], quick: bool) -> tuple[list[Result
         "failed": sum(bool(result.failed) for result in results),
         "laws": {case.name: case.law for case, _ in runs},
         "results": [result.plain() for result in results],
-        "notes": list(NOTES),
+        "notes": [*NOTES, f"{engines.in_words((f'{x.case} by {x.integrator}', x.engine) for x in results)}."],
     }
 
 
@@ -115,7 +118,7 @@ def print_report(results: Sequence[Result], report: dict[str, Any], folder: Path
         console.print(f"- {note}")
     about = report["environment"]
     console.print(
-        f"\n{len(results)} runs, {report['failed']} failed; {report['wall_s']:.0f} s; PyTorch {about['torch']}, "
-        f"{about['threads']} thread, {about['processor']}"
+        f"\n{len(results)} runs, {report['failed']} failed; {report['wall_s']:.0f} s; "
+        f"PyTorch {about['torch']}, {about['threads']} thread, {about['processor']}"
     )
     print(f"written: {', '.join(str(folder / name) for name in FILES)}")

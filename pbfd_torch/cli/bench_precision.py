@@ -14,10 +14,11 @@ from rich.console import Console
 from tqdm import tqdm
 
 from pbfd_torch.cli.benchmarks import chosen, environment, new_table, plain, write_files
-from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.options import EngineChoice, EngineOption, use_threads
 from pbfd_torch.cli.outputs import check_folder
 from pbfd_torch.files import write_whole
 from pbfd_torch.integrators.named import INTEGRATORS
+from pbfd_torch.native.engine import Engine
 
 if TYPE_CHECKING:
     from pbfd_torch.bench.precision import Effort
@@ -34,6 +35,7 @@ def precision(
     quick: Annotated[
         bool, typer.Option("--quick", help="Two time steps, a small batch, short timings, and two scenes by default.")
     ] = False,
+    engine: EngineOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
 ) -> None:
     """Compares error and wall time of our integrators and MuJoCo's on the same scenes over a range of time steps. One thread,
@@ -46,7 +48,7 @@ def precision(
     chosen_integrators = chosen("--integrators", integrators, INTEGRATORS, what="names ")
     check_folder(out, FILES)
     use_threads(1)
-    report = measured(chosen_scenes, chosen_integrators, effort)
+    report = measured(chosen_scenes, chosen_integrators, effort, EngineChoice.engine(engine))
     write(report, out)
     if as_json:
         print(json.dumps(plain(report), allow_nan=False))
@@ -55,10 +57,10 @@ def precision(
     raise typer.Exit(min(1, sum(row["unsolved_steps"] for scene in report["scenes"].values() for row in scene["rows"])))
 
 
-def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) -> dict[str, Any]:
+def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort, engine: Engine | None) -> dict[str, Any]:
     """Everything as plain data; with a progress bar on a terminal."""
-    from pbfd_torch.bench import mujoco_runs
-    from pbfd_torch.bench.precision import NOTES, measure_scene
+    from pbfd_torch.bench import engines, mujoco_runs
+    from pbfd_torch.bench.precision import NOTES, PEER, measure_scene
     from pbfd_torch.bench.precision_levels import losses
     from pbfd_torch.bench.precision_scenes import CASES
 
@@ -70,7 +72,9 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) 
     with tqdm(total=total, unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
         for name in scenes:
             bar.set_description(name)
-            found[name] = measure_scene(CASES[name], integrators, peers, effort, bar.update)
+            found[name] = measure_scene(CASES[name], integrators, peers, effort, bar.update, engine)
+    ours = [row for scene in found.values() for row in scene["rows"] if row["simulator"] != PEER]
+    made = engines.in_words((row["integrator"], row["engine"]) for row in ours)
     return {
         "wall_s": time.perf_counter() - started,
         "environment": environment() | {"mujoco": version},
@@ -78,7 +82,7 @@ def measured(scenes: Sequence[str], integrators: Sequence[str], effort: Effort) 
         "integrators": list(integrators),
         "scenes": found,
         "losses": losses(found),
-        "notes": [*NOTES, *mujoco_runs.absent("ours alone")],
+        "notes": [*NOTES, made, *mujoco_runs.absent("ours alone")],
     }
 
 

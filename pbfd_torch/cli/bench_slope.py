@@ -14,10 +14,11 @@ from rich.console import Console
 from tqdm import tqdm
 
 from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
-from pbfd_torch.cli.options import use_threads
+from pbfd_torch.cli.options import EngineChoice, EngineOption, use_threads
 from pbfd_torch.cli.outputs import check_folder
 from pbfd_torch.cli.ranges import TRAJECTORY
 from pbfd_torch.files import write_whole
+from pbfd_torch.native.engine import Engine
 
 if TYPE_CHECKING:
     from pbfd_torch.bench.figure_6 import Effort
@@ -31,6 +32,7 @@ def slope(
         float | None, TRAJECTORY.option("Simulated time of a trajectory in seconds; default: 10, or 1 with --quick.")
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Three time steps, a small batch, a short trajectory.")] = False,
+    engine: EngineOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
 ) -> None:
     """Slides a chain off a slope with ours, conventional Newton–Euler and MuJoCo: time against Δt, contacts and friction (Fig. 6),
@@ -41,7 +43,7 @@ def slope(
     check_folder(out, FILES)
     use_threads(1)
     effort = QUICK if quick else FULL
-    report = measured(effort if duration is None else dataclasses.replace(effort, duration=duration))
+    report = measured(effort if duration is None else dataclasses.replace(effort, duration=duration), EngineChoice.engine(engine))
     write(report, out)
     if as_json:
         print(json.dumps(plain(report), allow_nan=False))
@@ -51,24 +53,26 @@ def slope(
     raise typer.Exit(min(1, sum(row["unsolved_steps"] for row in rows if row["simulator"] in OURS)))
 
 
-def measured(effort: Effort) -> dict[str, Any]:
+def measured(effort: Effort, engine: Engine | None) -> dict[str, Any]:
     """Everything as plain data; with a progress bar on a terminal."""
-    from pbfd_torch.bench import mujoco_runs
-    from pbfd_torch.bench.figure_6 import measure, units
+    from pbfd_torch.bench import engines, mujoco_runs
+    from pbfd_torch.bench.figure_6 import FORMULATIONS, TITLES, measure, units
     from pbfd_torch.bench.figure_6_claims import NOTES, claims
 
     started = time.perf_counter()
     version = mujoco_runs.version()
     shortened = (f"at most {effort.most_steps} steps a run; in (b) Newton–Euler takes up to 4 times as many, MuJoCo all",)
-    with tqdm(total=units(effort), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
-        found = measure(effort, bar.update)
+    with tqdm(total=units(effort, engine), unit="run", disable=not sys.stderr.isatty(), leave=False) as bar:
+        found = measure(effort, bar.update, engine)
+    rows = [row for panel in ("time_steps", "contacts", "friction") for row in found[panel]]
+    made = engines.in_words((TITLES[row["simulator"]], row["engine"]) for row in rows if row["simulator"] in FORMULATIONS)
     report = {"duration_s": effort.duration, "worlds": effort.worlds, **found}
     return {
         "wall_s": time.perf_counter() - started,
         "environment": environment() | {"mujoco": version},
         "claims": claims(report),
         **report,
-        "notes": [*NOTES, *shortened, *mujoco_runs.absent("not compared")],
+        "notes": [*NOTES, made, *shortened, *mujoco_runs.absent("not compared")],
     }
 
 

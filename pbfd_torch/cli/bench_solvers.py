@@ -14,11 +14,12 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from pbfd_torch.cli.benchmarks import environment, new_table, plain, write_files
-from pbfd_torch.cli.options import Choices, load_setup, use_threads
+from pbfd_torch.cli.benchmarks import environment, new_table, plain, three_digits, write_files
+from pbfd_torch.cli.options import Choices, EngineChoice, EngineOption, load_setup, use_threads
 from pbfd_torch.cli.outputs import check_folder
 from pbfd_torch.cli.ranges import MEASURED_SECONDS, MEASURED_STEP, MEASURED_STEPS, MEASURED_WORLDS, REPEATS
 from pbfd_torch.errors import InputError
+from pbfd_torch.native.engine import Engine
 
 MOST_DOFS = 200
 FILES = ("solvers.json", "fig4.png", "table1.png")
@@ -35,15 +36,16 @@ def solvers(
     sizes: Annotated[str, typer.Option(help="Table I: degrees of freedom, separated by commas.")] = "5,10,20,40,80",
     batch: Annotated[int, MEASURED_WORLDS.option("Table I: worlds in the batch, beside a single one.")] = 256,
     repeats: Annotated[int, REPEATS.option("Times that a short measurement is repeated; the shortest counts.")] = 5,
+    engine: EngineOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")] = False,
 ) -> None:
     """Compares LM, JTJ-LM and L-BFGS on E and GE with the default: Fig. 4 (iterations, time and error of every step of two chains)
-    and Table I (cost of each substep over the degrees of freedom). One thread, float64. Exit status 1: the default left a step
-    unsolved."""
+    and Table I (cost of each substep over the degrees of freedom). Solves and substeps are PyTorch's, all of them; --engine makes
+    the motions that Fig. 4 takes its steps from. One thread, float64. Exit status 1: the default left a step unsolved."""
     counts = parsed_sizes(sizes)
     check_folder(out, FILES)
     use_threads(1)
-    report = measured(steps, dt, worlds, seconds, counts, batch, repeats)
+    report = measured(steps, dt, worlds, seconds, counts, batch, repeats, EngineChoice.engine(engine))
     write(report, out)
     if as_json:
         print(json.dumps(plain(report), allow_nan=False))
@@ -64,8 +66,9 @@ def parsed_sizes(text: str) -> list[int]:
 
 
 def measured(
-    steps: int, dt: float | None, worlds: int, seconds: float, sizes: Sequence[int], batch: int, repeats: int
-) -> dict[str, Any]:
+    steps: int, dt: float | None, worlds: int, seconds: float, sizes: Sequence[int], batch: int, repeats: int,
+    engine: Engine | None,
+) -> dict[str, Any]:  # fmt: skip
     """Everything that the command measures, as plain data; with a progress bar on a terminal."""
     from pbfd_torch.bench import figure_4, table_1
     from pbfd_torch.bench.timing import fit_sizes
@@ -78,7 +81,7 @@ def measured(
         for name in figure_4.CHAINS:
             bar.set_description(name)
             setup = load_setup(name, worlds, Choices(seed=0))
-            chains[name] = figure_4.measure_chain(setup, dt or setup.dt, steps, seconds, repeats, bar.update)
+            chains[name] = figure_4.measure_chain(setup, dt or setup.dt, steps, seconds, repeats, bar.update, engine)
         costs = {}
         for variant in variants:
             bar.set_description(f"Table I, {variant.key}")
@@ -139,7 +142,7 @@ def print_report(report: dict[str, Any], folder: Path) -> None:
 def _figure_4_table(name: str, chain: dict[str, Any]) -> Table:
     table = new_table(
         f"Fig. 4, {name}: {chain['steps']} steps of {chain['dt']:g} s, worlds: {chain['worlds']}; reference solved to "
-        f"{_number(chain['reference_residual_norm_max'])}",
+        f"{_number(chain['reference_residual_norm_max'])}; motion: {chain['engine']}, solves: torch",
         *("case", "budget", "failed\n/steps", "iterations\nmean/p95/max", "time [ms]\nmean/p95/max", "×\ndefault"),
         *("largest\nresidual", "tip error\n[m]"),
     )
@@ -148,9 +151,9 @@ def _figure_4_table(name: str, chain: dict[str, Any]) -> Table:
             case,
             str(found["budget"] or ""),
             f"{found['unsolved_steps']}/{found['measured_steps']}",
-            "/".join(_three_digits(found["iterations"][key]) for key in ("mean", "p95", "max")),
-            "/".join(_three_digits(found["time_ms"][key]) for key in ("mean", "p95", "max")),
-            _three_digits(found["time_of_default"]),
+            "/".join(three_digits(found["iterations"][key]) for key in ("mean", "p95", "max")),
+            "/".join(three_digits(found["time_ms"][key]) for key in ("mean", "p95", "max")),
+            three_digits(found["time_of_default"]),
             _number(found["residual_norm_max"]),
             _number(found["tip_error_max_m"]),
         )
@@ -186,11 +189,7 @@ def _substep_table(title: str, found: dict[str, Any], sizes: Sequence[int]) -> T
         f"{title} (autodiff: {found['worlds_of_autodiff']}): time per world [µs]", "substep", *columns, "exponent", "error"
     )
     for row in found["substeps"].values():
-        result.add_row(row["label"], *map(_three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", _number(row["error_max"]))
+        result.add_row(row["label"], *map(three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", _number(row["error_max"]))
     for case, row in found["iterations"].items():
-        result.add_row(f"iteration: {case}", *map(_three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", "")
+        result.add_row(f"iteration: {case}", *map(three_digits, row["us_per_world"]), f"{row['exponent']:.2f}", "")
     return result
-
-
-def _three_digits(value: float) -> str:
-    return f"{value:.3g}" if value < 100 else f"{value:.0f}"

@@ -82,3 +82,8 @@ def new_table(title: str, *headers: str) -> Table:
     for k, header in enumerate(headers):
         result.add_column(header, justify="right" if k else "left", overflow="fold")
     return result
+
+
+def three_digits(value: float) -> str:
+    """A positive number in a table."""
+    return f"{value:.3g}" if value < 100 else f"{value:.0f}"

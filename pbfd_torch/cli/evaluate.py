@@ -36,7 +36,8 @@ def evaluate(
     out: Annotated[Path | None, typer.Option(help="Folder for the picture, the numbers and a rollout of each.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")] = False,
 ) -> None:
-    """Mean return and spread of policies, where they were trained and elsewhere."""
+    """Mean return and spread of policies, where they were trained and elsewhere. The engine column says what makes the steps: those
+    of pbfd the compiled core where it can, of newton-euler PyTorch, of mujoco itself."""
     from pbfd_torch.learning.evaluation import Policy, Trial, draw, tried
 
     if out is not None:
@@ -60,6 +61,7 @@ def evaluate(
                     "policy": name,
                     "env": policy.settings.name,
                     "on": kind,
+                    "engine": trial.engine,
                     "dt": trial.dt,
                     "mean_return": trial.mean,
                     "spread": trial.spread,
@@ -77,11 +79,11 @@ def evaluate(
         print(json.dumps({"trials": numbers}))
         return
     table = Table(title=f"{episodes} episodes each", title_justify="left")
-    for column in ("policy", "on", "Δt [s]", "mean return", "spread", "steps", "unsolved", "kept"):
+    for column in ("policy", "on", "engine", "Δt [s]", "mean return", "spread", "steps", "unsolved", "kept"):
         table.add_column(column)
     for x in numbers:
         table.add_row(
-            x["policy"], x["on"], f"{x['dt']:g}", f"{x['mean_return']:.1f}", f"{x['spread']:.1f}", f"{x['mean_length']:.0f}",
-            str(x["unsolved_episodes"]), f"{x['kept']:.0%}",
+            x["policy"], x["on"], x["engine"], f"{x['dt']:g}", f"{x['mean_return']:.1f}", f"{x['spread']:.1f}",
+            f"{x['mean_length']:.0f}", str(x["unsolved_episodes"]), f"{x['kept']:.0%}",
         )  # fmt: skip
     Console(markup=False, emoji=False).print(table)

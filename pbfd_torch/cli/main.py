@@ -22,7 +22,7 @@ from pbfd_torch.cli.options import (
     Choices,
     Device,
     Dtype,
-    EngineChoice,
+    EngineOption,
     Friction,
     Integrator,
     Schedule,
@@ -73,10 +73,7 @@ def simulate(
     solver: Annotated[
         SolverChoice, typer.Option(help="Solver; direct: without fallbacks; damped, lm, lbfgs: on ½‖r‖², as the paper has them.")
     ] = SolverChoice.JTJ_LM,
-    engine: Annotated[
-        EngineChoice | None,
-        typer.Option(help="What makes the steps; default: the compiled core where it can, else torch."),
-    ] = None,
+    engine: EngineOption = None,
     friction: Annotated[Friction | None, typer.Option(help="Friction law; default: the scene's (Coulomb).")] = None,
     dtype: Annotated[Dtype, typer.Option(help="Floating-point type.")] = Dtype.FLOAT64,
     device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.CPU,

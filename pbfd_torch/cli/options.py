@@ -8,9 +8,10 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import typer
 
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.named import INTEGRATORS
@@ -56,6 +57,17 @@ class EngineChoice(enum.StrEnum):
     NATIVE = "native"
     TORCH = "torch"
 
+    @staticmethod
+    def engine(choice: EngineChoice | None) -> Engine | None:
+        """What was chosen; None: the core where it can."""
+        return None if choice is None else _ENGINES[choice]
+
+
+EngineOption = Annotated[
+    EngineChoice | None,
+    typer.Option("--engine", help="What makes the steps; default: the compiled core where it can, else torch."),
+]
+
 
 class Friction(enum.StrEnum):
     COULOMB = "coulomb"
@@ -87,7 +99,7 @@ _SOLVERS: dict[SolverChoice, Callable[[], Solver]] = {
     SolverChoice.LBFGS: lambda: OnSquares(lbfgs()),
 }
 
-_ENGINES: dict[EngineChoice | None, Engine | None] = {None: None, EngineChoice.NATIVE: Native(), EngineChoice.TORCH: Torch()}
+_ENGINES: dict[EngineChoice, Engine] = {EngineChoice.NATIVE: Native(), EngineChoice.TORCH: Torch()}
 
 
 @dataclass(frozen=True)
@@ -120,7 +132,7 @@ class Choices:
 
     def make_simulator(self, scene: Scene, dt: float) -> Simulator[Any]:
         """Raises `InputError` for a Δt or an accuracy out of range, and for an engine that cannot."""
-        integrator, solver, engine = INTEGRATORS[self.integrator.value](), self.make_solver(), _ENGINES[self.engine]
+        integrator, solver, engine = INTEGRATORS[self.integrator.value](), self.make_solver(), EngineChoice.engine(self.engine)
         if self.accuracy is None:
             return Simulator(scene, dt, integrator, solver, engine=engine)
         return AdaptiveSimulator(scene, dt, self.accuracy, integrator, solver, engine=engine)

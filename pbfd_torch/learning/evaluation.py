@@ -59,13 +59,14 @@ class Trial:
     """What came of it.
 
     Attributes:
-        on: the simulator. dt: its step [s].
+        on: the simulator. engine: that makes its steps: native, torch or mujoco. dt: its step [s].
         returns, lengths: `[episodes]`, lengths in control steps.
         unsolved: episodes that ended because a step had no solution.
         rollout: of the first few worlds, as long as the longest of them lasts.
     """
 
     on: str
+    engine: str
     dt: float
     returns: Tensor
     lengths: Tensor
@@ -119,7 +120,7 @@ def tried(
     rollout = tracked(
         env.scene, env.control_dt, torch.stack([x for x, _ in kept]), torch.stack([x for _, x in kept]), f"{settings.name}, {on}"
     )
-    return Trial(on, worlds.dt, returns, lengths, int(failed.sum()), rollout)
+    return Trial(on, worlds.engine, worlds.dt, returns, lengths, int(failed.sum()), rollout)
 
 
 def draw(trials: Mapping[str, list[Trial]], path: Path) -> None:

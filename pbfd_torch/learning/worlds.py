@@ -14,6 +14,7 @@ from pbfd_torch import models
 from pbfd_torch.conventional.newton_euler import NewtonEuler
 from pbfd_torch.envs import PbfdEnv
 from pbfd_torch.errors import InputError
+from pbfd_torch.native.engine import Torch
 
 OWN_FILES = {
     "hopper-3d": "hopper3d",
@@ -30,6 +31,8 @@ class TrialWorlds(Protocol):
     """A batch of worlds `[worlds]` in the environment's coordinates."""
 
     dt: float
+    engine: str
+    """That makes the steps: native, torch or mujoco."""
 
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Puts them there; where they are then."""
@@ -44,7 +47,7 @@ class PbfdWorlds:
     """As in training."""
 
     def __init__(self, env: PbfdEnv) -> None:
-        self._env, self.dt = env, env.dt
+        self._env, self.dt, self.engine = env, env.dt, env.simulator.engine
 
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """See `TrialWorlds`."""
@@ -68,7 +71,7 @@ class ConventionalWorlds:
     def __init__(self, env: PbfdEnv) -> None:
         self._substeps = max(1, round(env.control_dt / CONVENTIONAL_DT))
         self.dt = env.control_dt / self._substeps
-        self._stepper = NewtonEuler(env.scene, self.dt)
+        self._stepper, self.engine = NewtonEuler(env.scene, self.dt), Torch.name
 
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """See `TrialWorlds`."""
@@ -97,7 +100,7 @@ class MujocoWorlds:
         else:
             self._model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
             self.dt = self._model.opt.timestep = 0.002
-        self._substeps = max(1, round(env.control_dt / self.dt))
+        self._substeps, self.engine = max(1, round(env.control_dt / self.dt)), "mujoco"
         self._like = env.setup.q
 
     def start(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:

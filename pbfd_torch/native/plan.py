@@ -47,7 +47,7 @@ class Plan:
     """sizes: nodes, nq, nv, nu, those of the candidates, pushes. whole: `[n]` `int32`. real: `[n]` of the scene's dtype;
     `which` of them, `[varied]` `int32`, each world has its `own`, `[*batch, varied]`. sample: `[n]` of terrain and meshes.
     bodies: what may touch between them. dimension: 2 where all moves in a plane. apart: whether worlds differ by more than their
-    μ: the core knows these in space only, and not with BDF2. carriers: of the obstacles that move. order: where the candidates are
+    μ: the core knows these in space only. carriers: of the obstacles that move. order: where the candidates are
     among those of all contact terms. memory: of each term that remembers, in the order of a state's memory, where it begins among
     all numbers that are remembered, and its shape; remembered: how many these are. seats: where links are on the nodes."""
 
@@ -75,10 +75,9 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a stepper's scene, in a plane where it moves in one. Raises `NotCompiledError` naming what the core does not
     know."""
     _require_covered(stepper)
-    parts, bdf2 = _parts(stepper), isinstance(stepper.integrator, Bdf2)
-    if parts.apart and bdf2:
-        raise unknown("BDF2 of worlds that differ")
-    if parts.apart or bdf2 or parts.pushed or parts.bodies.rows or len(parts.carriers) or not parts.candidates.flat:
+    parts = _parts(stepper)
+    spatial = parts.apart or parts.pushed or parts.bodies.rows or len(parts.carriers) or not parts.candidates.flat
+    if spatial or isinstance(stepper.integrator, Bdf2):
         # of which the core knows space only
         return parts.plan()
     plane = plane_of(parts.a, [parts.gravity, *parts.candidates.normals])

@@ -64,7 +64,7 @@ TRAIN: dict[str, list[str]] = {
 }  # fmt: skip
 EVALUATE = {"--on": ["pbfd", "mujoco"], "--episodes": ["1"], "--seed": SEED, "--out": ["new", "text.npz"], "--json": [""]}
 OPTIMIZE = {"--iterations": ["1"], "--worlds": WORLDS, "--seed": SEED, "--threads": ["1"], "--out": ["new"], "--json": [""]}
-BENCH = {"--out": ["new", "text.npz"], "--quick": [""], "--json": [""]}
+BENCH = {"--out": ["new", "text.npz"], "--quick": [""], "--engine": ["native", "torch"], "--json": [""]}
 MEASURED = ("--steps", "--dt", "--worlds", "--seconds", "--sizes", "--batch", "--repeats")
 COMMANDS: dict[tuple[str, ...], tuple[list[str], dict[str, list[str]]]] = {
     ("simulate",): (SCENE, SIMULATE),

@@ -15,7 +15,7 @@ PBFD_FUNCTION const char* pbfd_target();
 // A scene as plan.h reads it, in space or, with dimension 2, in a plane. Scalars are of 8 or 4 bytes, those of all arrays below too.
 struct pbfd_plan {
   int bytes, dimension, nodes, nq, nv, nu, candidates, anchors, planes, solids, samples, forms, uncommon, pushes;
-  int varied;  // numbers of which each world has its own: others than μ in space only, and not of BDF2
+  int varied;  // numbers of which each world has its own: others than μ in space only
   const int* whole;
   const void* real;
   const void* sample;  // of terrain and meshes

@@ -46,26 +46,20 @@ template <class V, int D, class F> void with_each(const pbfd_plan* p, const void
   make(plan, own, plan.contact.grip, arena);
 }
 
-// The same; worlds that differ by their μ, if at all, share a plan: there is less to be read. EACH: whether there are others.
-template <class V, int D, bool EACH, class F> void with_several(const pbfd_plan* p, const void* rows, Arena<V> arena, F&& make) {
+// The same; worlds that differ by their μ, if at all, share a plan: there is less to be read. Others are seen in space.
+template <class V, int D, class F> void with_several(const pbfd_plan* p, const void* rows, Arena<V> arena, F&& make) {
   using T = typename Kind<V>::Scalar;
   const T* real = static_cast<const T*>(p->real);
   const Plan<T, D> plan = plan_of<T, D>(p, real);
   [[maybe_unused]] const int first = int(plan.contact.grip - real), end = first + p->candidates;
-  if constexpr (EACH)
+  if constexpr (D == 3)
     if (p->varied && (p->which[0] < first || p->which[p->varied - 1] >= end)) return with_each<V, D>(p, rows, arena, make);
   Numbers<V> own = numbers_of(p, rows, first, p->candidates, arena);
   make(plan, own, static_cast<const V*>(own.lanes), arena);
 }
 
-// Of worlds that differ by more than their μ the core makes steps in space only, and not those of BDF2: the library is to be built
-// in a minute or two.
-template <template <class, class, int> class> constexpr bool apart = true;
-template <> constexpr bool apart<Bdf2> = false;
-
 // Steps of a scheme, and starts.
 template <template <class, class, int> class Scheme> struct Going {
-  static constexpr bool differing = apart<Scheme>;
   template <class V, class N, int D>
   static void make(const pbfd_plan* p, const pbfd_steps* s, const Plan<N, D>& plan, Numbers<V>& own, const V* grip,
                    Arena<V>& arena) {
@@ -76,7 +70,6 @@ template <template <class, class, int> class Scheme> struct Going {
 };
 
 template <template <class, class, int> class Scheme> struct Starting {
-  static constexpr bool differing = apart<Scheme>;
   template <class V, class N, int D>
   static void make(const pbfd_plan* p, const pbfd_steps* s, const Plan<N, D>& plan, Numbers<V>& own, const V* grip,
                    Arena<V>& arena) {
@@ -112,7 +105,7 @@ template <class What, class T, int D> void make_of(const pbfd_plan* p, const pbf
   if (s->last - s->first == 1)
     with_each<T, D>(p, s->own, {static_cast<T*>(room)}, make);
   else
-    with_several<V, D, D == 3 && What::differing>(p, s->own, {static_cast<V*>(room)}, make);
+    with_several<V, D>(p, s->own, {static_cast<V*>(room)}, make);
 }
 
 template <class What> void in_space(const pbfd_plan* p, const pbfd_steps* s, void* room) {
@@ -147,7 +140,7 @@ template <template <class, class, int> class Scheme> struct Recording {
 template <template <class, class, int> class Scheme, class T>
 void record_of(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, void* room) {
   using V = Lanes<T, register_bytes / int(sizeof(T))>;
-  with_several<V, 3, apart<Scheme>>(p, a->own, {static_cast<V*>(room)}, [&](auto& plan, auto& own, auto* grip, auto& arena) {
+  with_several<V, 3>(p, a->own, {static_cast<V*>(room)}, [&](auto& plan, auto& own, auto* grip, auto& arena) {
     Recording<Scheme>::make(p, r, a, plan, own, grip, arena);
   });
 }
