@@ -15,7 +15,7 @@ from pbfd_torch.native.engine import Engine, Native, Torch
 from pbfd_torch.native.library import library
 from pbfd_torch.viewer import Live
 from pbfd_torch.viewer.live import FRAME
-from pbfd_torch.viewer.strides import recorded, strode
+from pbfd_torch.viewer.strides import strode
 
 DT = 0.005
 compiled = pytest.mark.skipif(library() is None, reason="there is no core")
@@ -44,9 +44,9 @@ def test_records_are_those_of_rollouts(name: str, engine: Engine) -> None:
     control, count = setup.controls(1)[0], 0
     while count < 3:
         stride = strode(simulator, state, control, 3 - count)
-        assert len(stride) == (3 if simulator.engine == "native" else 1)
-        state, count = stride.end, count + len(stride)
-    rollout, last = simulator.rollout(start, setup.controls(3)), recorded(simulator, stride, control)
+        assert stride.steps == (3 if simulator.engine == "native" else 1)
+        state, count = stride.after, count + stride.steps
+    rollout, last = simulator.rollout(start, setup.controls(3)), stride.record()
     assert last.steps == 1
     assert torch.equal(stride.solution.status[-1], rollout.status[-1])
     for field in DRAWN:

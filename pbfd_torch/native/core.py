@@ -124,6 +124,11 @@ class Journey:
             asked.before_last[: len(frames.before_last)] = [x.data_ptr() for x in frames.before_last.values()]
         return asked
 
+    def other(self, time: Tensor) -> dict[str, Tensor]:
+        """What states after steps have besides the core's fields, at these times `[*steps, *batch]`."""
+        pace = {} if self.frames is None else {"pace": self.frames.pace}
+        return {"time": time, "hazards": self.counted["hazards"]} | pace
+
     @property
     def solution(self) -> Solution:
         """How the steps were solved, `[*steps, *batch, ...]`."""

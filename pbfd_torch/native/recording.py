@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Mapping
 from typing import Any, Generic
 
 import torch
@@ -58,13 +59,23 @@ class Writer(Generic[S]):
         self._scheme, self._plan = SCHEMES[type(eager.integrator)], plan
         self._calls, self._own = Calls(library, space, threads), space.own
 
-    def write(self, before: S, states: S, arrays: dict[str, Tensor], frames: Frames | None = None) -> None:
-        """Of steps or frames from the state before the first to those after each `[*steps, *batch, …]`, in arrays of this length:
-        the state after each, and its contacts if there is a `suspect`; `hazards` are there already."""
-        given, found = (self._scheme.fields(x, self._plan) for x in (before, states))
+    def fields(self, state: S) -> dict[str, Tensor]:
+        """Those of a state, as the core has them."""
+        return self._scheme.fields(state, self._plan)
+
+    def write(
+        self,
+        times: Tensor,
+        given: Mapping[str, Tensor],
+        found: Mapping[str, Tensor],
+        arrays: dict[str, Tensor],
+        frames: Frames | None = None,
+    ) -> None:
+        """Of steps or frames from the state before the first to those after each, at times `[steps + 1, *batch]`, in arrays of this
+        length: the state after each, and its contacts if there is a `suspect`; `hazards` are there already."""
         given = given if frames is None else frames.before_last
-        batch = tuple(before.q.shape[:-1])
-        worlds, steps = math.prod(batch), math.prod(states.q.shape[:-1])
+        batch = tuple(times.shape[1:])
+        worlds, steps = math.prod(batch), math.prod(found["q"].shape[:-1])
         alike = self._size.ndim == 0
         dt = self._size if alike else whole(self._size, batch)
         asked = _Record(dt.data_ptr(), alike, None if frames is None else frames.spacing.data_ptr(), worlds, 0, steps)
@@ -72,8 +83,7 @@ class Writer(Generic[S]):
             asked.given[i], asked.found[i] = start.data_ptr(), end.data_ptr()
         for name, array in arrays.items():
             setattr(asked, name, array.data_ptr())
-        ends = states.time if states.time.ndim > before.time.ndim else states.time[None]
-        poses = self._plan.carriers.poses(torch.cat((before.time[None], ends)))
+        poses = self._plan.carriers.poses(times)
         asked.poses, asked.timed = poses.data_ptr(), poses.shape[1]
         own, r = whole(self._own, (*batch, self._own.shape[-1])), self.roster
         asked.own = own.data_ptr()
@@ -108,20 +118,21 @@ class Record(Generic[S]):
                 self._contacts[name][..., slots, :] = values
             else:
                 self._contacts[name][..., slots] = values
-        writer.write(state, state, {name: x[:1] for name, x in self._states.items()})
+        now = writer.fields(state)
+        writer.write(state.time.expand(2, *batch), now, now, {name: x[:1] for name, x in self._states.items()})
 
     def add(self, stretch: Stretch[S]) -> None:
         """Further steps. An interruption before the end leaves the record as it was."""
-        before, states, solution = stretch.before, stretch.states, stretch.solution
+        solution, time, hazards = stretch.solution, stretch.other["time"], stretch.other["hazards"]
         first, last = self.steps, self.steps + len(stretch)
         if solution.steps is not None:
             self._substeps[first:last] = solution.steps
-        self._seen["hazards"][first:last] = states.hazards
+        self._seen["hazards"][first:last] = hazards
         for name in _SOLUTION:
             self._solution[name][first:last] = getattr(solution, name)
         arrays = {name: x[first + 1 : last + 1] for name, x in self._states.items()}
         arrays |= {name: x[first:last] for name, x in (self._contacts | self._seen).items()}
-        self._writer.write(before, states, arrays, stretch.frames)
+        self._writer.write(torch.cat((stretch.began[None], time)), stretch.given, stretch.found, arrays, stretch.frames)
         self.steps, self._lanes = last, self._lanes + solution.lanes
 
     def finish(self) -> Rollout:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any, Generic, cast
 
 import torch
@@ -117,7 +117,7 @@ class NativeStepper(Generic[S]):
         journey = self._went(state, None if control is None else control[None], ())
         solution, ways = journey.solution, journey.ways
         way = Way(solution.q) if ways is None else ways.way(self.integrator, solution.q)
-        return self._after(state, journey, state.time + self.step_size), solution, way
+        return self._restored(state, journey.found, journey.other(state.time + self.step_size)), solution, way
 
     def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """The states after each of so many steps, `[steps, *batch, ...]`, and how each was solved; see `stretch`."""
@@ -126,10 +126,10 @@ class NativeStepper(Generic[S]):
 
     def stretch(self, state: S, controls: Tensor | None, steps: int) -> Stretch[S]:
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero)."""
-        state = self.complete(state)
         journey = self._went(state, controls, (steps,))
-        states = self._after(state, journey, passed(state.time, self.step_size, steps)[1:])
-        return Stretch(state, states, journey.solution, journey.frames)
+        other = journey.other(passed(state.time, self.step_size, steps)[1:])
+        make = partial(self._restored, state)
+        return Stretch(state.time, journey.given, journey.found, other, journey.solution, journey.frames, make)
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
         """The states after steps, and how these were solved."""
@@ -137,17 +137,16 @@ class NativeStepper(Generic[S]):
             controls = state.q.new_zeros(1, self.scene.nu)
         return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps, self._accuracy)
 
-    def _after(self, state: S, journey: Journey, time: Tensor) -> S:
-        """The states after steps from a state, at these times."""
+    def _restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
+        """The states after steps from a state, of the core's fields and what else they have."""
         plan = self._core.plan
-        found, memory = self._scheme.restored(journey.found, plan), state.memory
+        fields, memory, time = self._scheme.restored(dict(found), plan), state.memory, other["time"]
         if plan.remembered:
-            whole = found["memory"]
+            whole = fields["memory"]
             memory = tuple(whole[..., first : first + n * width].unflatten(-1, (n, width)) for first, n, width in plan.memory)
         elif time.ndim > state.time.ndim:  # there is nothing in it
             memory = tuple(x.expand(len(time), *x.shape) for x in memory)
-        pace = None if journey.frames is None else journey.frames.pace
-        return replaced(state, **found | {"time": time, "hazards": journey.counted["hazards"], "memory": memory, "pace": pace})
+        return replaced(state, **fields | {"pace": None} | dict(other) | {"memory": memory})
 
     def complete(self, state: S) -> S:
         """With zero for an acceleration that is not known, and anchors where there is nothing in the memory yet."""

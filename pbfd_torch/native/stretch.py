@@ -1,9 +1,13 @@
-"""Steps that the compiled core has made one after the other."""
+"""Steps that the compiled core has made one after the other, as it has them: states are made of that when they are asked for."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic
+
+from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.native.core import Frames
@@ -16,28 +20,40 @@ class Stretch(Generic[S]):
     """Several steps, or frames.
 
     Attributes:
-        before: the state before the first.
-        states: those after each, `[steps, *batch, ...]`.
-        solution: how each was solved, likewise.
+        began: when `[*batch]` [s].
+        given: the core's fields of the state before the first, `[*batch, ...]`.
+        found: those after each, `[steps, *batch, ...]`; other: what else states have, likewise: `time`, `hazards`, `pace`.
+        solution: how each was solved.
         frames: what there is beside, where they are frames.
+        restored: makes states of the fields and what else they have.
     """
 
-    before: S
-    states: S
+    began: Tensor
+    given: Mapping[str, Tensor]
+    found: Mapping[str, Tensor]
+    other: Mapping[str, Tensor]
     solution: Solution
-    frames: Frames | None = None
+    frames: Frames | None
+    restored: Callable[[Mapping[str, Tensor], Mapping[str, Tensor]], S]
 
     def __len__(self) -> int:
         return len(self.solution.status)
 
     def part(self, first: int, last: int) -> Stretch[S]:
         """Steps first … last − 1 of them."""
-        states, solution = (mapped(lambda x: x[first:last], whole) for whole in (self.states, self.solution))
-        before = mapped(lambda x: x[first - 1], self.states) if first else self.before
-        return Stretch(before, states, solution, None if self.frames is None else self.frames.part(first, last))
+        found, other = ({name: x[first:last] for name, x in some.items()} for some in (self.found, self.other))
+        given = {name: x[first - 1] for name, x in self.found.items()} if first else self.given
+        frames = None if self.frames is None else self.frames.part(first, last)
+        began = self.other["time"][first - 1] if first else self.began
+        return Stretch(began, given, found, other, mapped(lambda x: x[first:last], self.solution), frames, self.restored)
 
-    @property
+    @cached_property
+    def states(self) -> S:
+        """Those after each, `[steps, *batch, ...]`."""
+        return self.restored(self.found, self.other)
+
+    @cached_property
     def end(self) -> S:
         """The state after the last."""
-        end: S = mapped(lambda x: x[-1], self.states)
-        return end
+        found, other = ({name: x[-1] for name, x in some.items()} for some in (self.found, self.other))
+        return self.restored(found, other)

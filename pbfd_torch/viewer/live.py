@@ -30,7 +30,7 @@ from pbfd_torch.viewer import server as serving
 from pbfd_torch.viewer.film import Film
 from pbfd_torch.viewer.served import Served
 from pbfd_torch.viewer.stage import Stage
-from pbfd_torch.viewer.strides import recorded, strode
+from pbfd_torch.viewer.strides import strode
 
 STEPS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1)  # [s] to choose from
 FRAME = 0.02  # [s] from picture to picture where steps are shorter, and the longest that steps are made without one
@@ -117,9 +117,9 @@ class Live(Served):
         began, count = time.perf_counter(), 0
         while count < most and (count == 0 or time.perf_counter() - began < FRAME):
             stride = strode(self._simulator, self._state, control, min(usual, most - count))
-            self._state, count = stride.end, count + len(stride)
+            self._state, count = stride.after, count + stride.steps
             solutions.append(stride.solution)
-        return recorded(self._simulator, stride, control), solutions
+        return stride.record(), solutions
 
     def _run(self) -> None:
         due = time.perf_counter()
