@@ -18,7 +18,7 @@ from torch import Tensor
 from pbfd_torch.bench import mujoco_runs
 from pbfd_torch.bench.precision_scenes import CASES, FRAME, Case
 from pbfd_torch.bench.precision_tracks import Track
-from pbfd_torch.bench.stepped import stepped
+from pbfd_torch.bench.stepped import solved
 from pbfd_torch.bench.timing import Progress, timed
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
@@ -186,7 +186,7 @@ def _step_time(simulator: Simulator[Any], start: Any, controls: Sequence[Tensor 
     span, given = len(controls), [x for x in controls if x is not None]
     if isinstance(simulator.stepper, NativeStepper):
         held = torch.stack(given) if given else None
-        return timed(lambda: lambda: stepped(simulator, start, span, held), MOST_CALLS, enough_s=seconds)[1] / span
+        return timed(lambda: lambda: solved(simulator, start, span, held), MOST_CALLS, enough_s=seconds)[1] / span
     state, count, began = start, 0, time.perf_counter()
     while count < 2 or time.perf_counter() - began < seconds:
         state = start if count % span == 0 else state
