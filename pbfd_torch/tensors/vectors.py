@@ -78,13 +78,8 @@ def extended(points: Tensor) -> Tensor:
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
     """a × b, `[*, n, 3], [*, n, 3] → [*, n, 3]`."""
-    return torch.stack(cross_coordinates(a, b), -2).mT
-
-
-def cross_coordinates(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The coordinates of a × b, `[*, 3], [*, 3] → [*]` each."""
     (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return torch.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), -2).mT
 
 
 def unit(vector: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:

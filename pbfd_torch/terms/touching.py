@@ -18,7 +18,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import cross, cross_coordinates, dot, outer, rows, trace_minus
+from pbfd_torch.tensors.vectors import cross, dot, outer, rows, trace_minus
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
@@ -221,25 +221,6 @@ class ContactForce:
         at, answer = self.at, self.answer()
         torque, wandering = skew(at.points) @ answer, at.wandering(self.force)
         return torch.cat((torque if wandering is None else torque + wandering, answer), -2)
-
-    def factors(self) -> list[tuple[Tensor, Tensor]]:
-        """`stiffness` of points at flat solids as a sum of products of `arm(c, l)` and `arm(c, r)`: the pairs l, r `[*, n, 3]`. The
-        part G XᵀX with X = `shifting(c)` is left to the second moments of G."""
-        at = self.at
-        by_depth, by_size = self._normal_slopes
-        if self._drag_slopes is None:
-            return [(by_depth[..., None] * at.normal, at.normal)]
-        drag, drag_by_depth, drag_by_size = self._drag_slopes
-        first = torch.addcmul(-drag_by_depth[..., None] * at.slip, (by_depth - drag)[..., None], at.normal)
-        second = drag_by_size[..., None] * at.slip
-        if by_size is not None:
-            second = torch.addcmul(second, by_size[..., None], at.normal, value=-1)
-        return [(first, at.normal), (second, at.slip)]
-
-
-def arm(points: Tensor, forces: Tensor) -> Tensor:
-    """Wrench (p × f, f) about the world origin, `[*, 3], [*, 3] → [*, 6]`."""
-    return torch.stack((*cross_coordinates(points, forces), *forces.unbind(-1)), -2).mT
 
 
 def shifting(points: Tensor) -> Tensor:
