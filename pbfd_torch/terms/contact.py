@@ -23,7 +23,7 @@ from pbfd_torch.contact.surface import Field, Surface, Tangent
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
-from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, outer, turned
+from pbfd_torch.tensors.vectors import applied, extended, mapped, outer, rotated
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
@@ -172,7 +172,7 @@ class Contact(ContactLaws[PreparedContact]):
             centers = centers + dt[..., None] * (frame[..., :3] @ self.carrier.belt[:, None]).squeeze(-1)
         anchor = None
         if self._anchors:
-            anchor = memory if frame is None else turned(frame[..., :3], memory)
+            anchor = memory if frame is None else rotated(frame[..., :3], memory)
         surface = self.surface
         free = functools.cache(lambda: self._centers(step.target_poses))
         if math.isfinite(self.thickness):
@@ -221,7 +221,7 @@ class Contact(ContactLaws[PreparedContact]):
             return prepared.centers.new_zeros((*prepared.centers.shape[:-2], 0, 3))  # a view would keep all of them
         at = self.touching(prepared, placement)
         kept = self._anchors.kept(at.slip, at.depth)
-        return kept if prepared.frame is None else turned(prepared.frame[..., :3].mT, kept)
+        return kept if prepared.frame is None else rotated(prepared.frame[..., :3].mT, kept)
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact with the values of some worlds."""
@@ -245,7 +245,7 @@ class Contact(ContactLaws[PreparedContact]):
         field = prepared.surface.field(seen(frame, centers))
         normal, bend = field.direction, None if field.flat else lambda: field.bend
         if frame is not None:
-            normal = turned(frame[..., :3], normal)
+            normal = rotated(frame[..., :3], normal)
             bend = None if field.flat else lambda: frame[..., :3] @ field.bend @ frame[..., :3].mT
         depth, moved = prepared.raised(self._depth(field, frame, placement.poses[..., :3, :3])), centers - prepared.centers
         if prepared.anchor is not None:
@@ -269,8 +269,8 @@ class Contact(ContactLaws[PreparedContact]):
         if self.rounded:  # as in the slip: the surface moves by φ × s beside its centre
             out = contact.at.centers - contact.at.points
             spin = motion.twists[..., self.link, :3]
-            velocity = velocity - cross(spin, out)
-            acceleration = acceleration - cross(motion.drifts[..., self.link, :3], out)
+            velocity = velocity - torch.linalg.cross(spin, out)
+            acceleration = acceleration - torch.linalg.cross(motion.drifts[..., self.link, :3], out)
             if (bulge := contact.at.bulge(spin)) is not None:
                 acceleration = acceleration - bulge[..., None] * contact.at.normal
         return contact_outlook(contact, velocity, acceleration)
@@ -297,4 +297,4 @@ class Contact(ContactLaws[PreparedContact]):
 
 def seen(frame: Tensor | None, points: Tensor) -> Tensor:
     """World points in a frame `[*batch, 1, 3, 4]`, or themselves."""
-    return points if frame is None else turned(frame[..., :3].mT, points - frame[..., 3])
+    return points if frame is None else rotated(frame[..., :3].mT, points - frame[..., 3])
