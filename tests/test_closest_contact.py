@@ -16,7 +16,7 @@ from pbfd_torch import Articulation, Joint, JointKind, Link, Rollout, Scene, Sim
 from pbfd_torch.contact.closest import Meeting, RoundShape, RoundTable
 from pbfd_torch.contact.polytope import polytope_of
 from pbfd_torch.contact.shapes import Capsule, Collider, Cylinder, Ellipsoid, Shape, Sphere
-from pbfd_torch.tensors.vectors import turned
+from pbfd_torch.tensors.vectors import rotated
 from pbfd_torch.terms.approaching import closest_approach
 from pbfd_torch.terms.contact_terms import ContactRules, contact_terms
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
@@ -50,7 +50,7 @@ def nearest(one: Shape, other: Shape, bodies: Tensor) -> Nearest:
     table, frames = RoundTable.of([(first, second)], bodies.new_zeros(())), bodies[..., None, :, :3, :]
     sought = table.sought(frames)
     both, plane = table.met(frames, sought)
-    out = turned(frames[..., 1, :, :3], plane.normal)
+    out = rotated(frames[..., 1, :, :3], plane.normal)
     seen, _ = closest_approach(Meeting(both, torch.ones_like(sought.alone)), frames, out)
     return Nearest(seen.gap[..., 0], seen.normal[..., 0, :], sought.alone[..., 0])
 

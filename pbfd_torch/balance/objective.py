@@ -166,12 +166,8 @@ class BalanceObjective:
         """Whether a step that ended at q has turned a joint by more than a quarter turn, and not because its free motion leads
         there, with more kinetic energy than the free motion has, while something touches, `[*batch]` bool: such a root need not
         be where the motion goes. What strikes may fold up fast; what stands may not turn over."""
-        a = self.articulation
-        far = torch.minimum(*(self.turn(difference(a, x, q)) for x in (self.step.previous.q, self.guess))) > FARTHEST
-        # what is in the host's own memory it may look at; asking a device would make it wait
-        if far.device.type == "cpu" and not bool(far.numpy().any()):
-            return far
-        step, a = self.step, self.articulation
+        a, step = self.articulation, self.step
+        far = torch.minimum(*(self.turn(difference(a, x, q)) for x in (step.previous.q, self.guess))) > FARTHEST
         moved, free = (
             kinetic_energy(a, (poses - step.previous.poses)[..., :3, :]) for poses in (place(a, q).poses, step.target_poses)
         )

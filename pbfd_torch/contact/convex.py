@@ -20,7 +20,7 @@ from pbfd_torch.contact.primitives import require_tensors
 from pbfd_torch.contact.segments import around_segment, from_segment
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
-from pbfd_torch.tensors.vectors import dot_of_rows, unit
+from pbfd_torch.tensors.vectors import dot, unit
 from pbfd_torch.tensors.worlds import Worlds
 
 
@@ -84,21 +84,21 @@ class ConvexSurface:
     def field(self, points: Tensor) -> Field:
         """See `Surface`."""
         place = points.detach()[..., None, :]
-        heights = dot_of_rows(place, self.normals) - self.offsets
+        heights = dot(place, self.normals) - self.offsets
         highest = heights.argmax(-1)
         face = self.normals[highest]
-        height = dot_of_rows(points, face) - self.offsets[highest]
+        height = dot(points, face) - self.offsets[highest]
         foot = (points - height[..., None] * face).detach()[..., None, :]
-        overhang = (dot_of_rows(foot, self.normals) - self.offsets).amax(-1)
+        overhang = (dot(foot, self.normals) - self.offsets).amax(-1)
         rounding = 8 * torch.finfo(points.dtype).eps * (self.size + height.detach().abs())
 
         offsets, _, _ = from_segment(place, self.starts, self.ends)
-        nearest = dot_of_rows(offsets, offsets).argmin(-1)
+        nearest = dot(offsets, offsets).argmin(-1)
         offset, direction, beside = from_segment(points, self.starts[nearest], self.ends[nearest])
         outward, inverse = unit(offset, face)
 
         on_face = overhang <= rounding
-        distance = torch.where(on_face, height, dot_of_rows(offset, outward))
+        distance = torch.where(on_face, height, dot(offset, outward))
         normal = torch.where(on_face[..., None], face, outward)
 
         def curvature() -> Tensor:

@@ -15,7 +15,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from pbfd_torch.contact.broad_phase import AllPairs, BroadPhase, FclTree
+from pbfd_torch.contact.broad_phase import overlapping
 from pbfd_torch.contact.candidates import Finder, Slots, nearest
 from pbfd_torch.contact.manifold import Manifold, manifold
 from pbfd_torch.contact.polytope import Polytope, PolytopeTable
@@ -26,7 +26,6 @@ from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.vectors import applied, dot, rotated
 
 POINTS = 8  # of one pair at most
-MANY = 30_000  # pairs from which on FCL's tree is faster than looking at all of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +36,6 @@ class PolytopePairs(Finder):
     body, frame: `[c]`, `[c, 4, 4]` the body of each collider, and where its shape is in it.
     polytopes, table: the shapes `[c]`, and as tensors.
     boxes: `[m]` bool, pairs of two boxes.
-    broad_phase: what picks the pairs that are looked at.
     """
 
     pair: Tensor
@@ -48,7 +46,6 @@ class PolytopePairs(Finder):
     polytopes: Sequence[Polytope]
     table: PolytopeTable
     boxes: Tensor
-    broad_phase: BroadPhase
 
     @classmethod
     def of(
@@ -74,7 +71,6 @@ class PolytopePairs(Finder):
             polytopes=tuple(polytopes),
             table=PolytopeTable.stack(polytopes).to(frames.dtype, device),
             boxes=torch.tensor(boxes, device=device),
-            broad_phase=FclTree(first, second) if len(pairs) > MANY else AllPairs(first, second),
             slots=slots,
         )
 
@@ -99,7 +95,7 @@ class PolytopePairs(Finder):
         poses = bodies[..., self.body, :, :] @ self.frame
         vertices = applied(poses[..., None, :3, :3], self.table.vertices) + poses[..., None, :3, 3]
         room = (self.table.radius + reach[..., self.body])[..., None]
-        near = self.broad_phase.near(vertices.amin(-2) - room, vertices.amax(-2) + room)
+        near = overlapping(vertices.amin(-2) - room, vertices.amax(-2) + room, self.first, self.second)
         world, row = near.reshape(-1, len(self.pair)).nonzero().unbind(-1)
         poses, reach = poses.flatten(0, -4) if batch else poses[None], reach.reshape(-1, reach.shape[-1])
         a, b = self.first[row], self.second[row]

@@ -17,7 +17,7 @@ from torch import Tensor
 from pbfd_torch.contact.segments import around_segment, from_segment
 from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
-from pbfd_torch.tensors.vectors import axis, dot, dot_of_rows, outer, unit
+from pbfd_torch.tensors.vectors import axis, dot, outer, unit
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
 
@@ -72,7 +72,7 @@ class SphereSurface:
             eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
             return inverse[..., None, None] * (eye - outer(normal, normal))
 
-        return Field(dot_of_rows(points, normal) - self.radius, normal, curvature)
+        return Field(dot(points, normal) - self.radius, normal, curvature)
 
     def take(self, worlds: Worlds) -> Self:
         """See `Surface`."""
@@ -97,7 +97,7 @@ class SegmentSurface:
         offset, direction, beside = from_segment(points, self.start, self.end)
         across = torch.linalg.cross(direction, _one_hot(direction.abs().argmin(-1), direction))
         normal, inverse = unit(offset, across)
-        distance = dot_of_rows(offset, normal) - self.radius
+        distance = dot(offset, normal) - self.radius
         return Field(distance, normal, lambda: around_segment(normal, direction, beside, inverse))
 
     def take(self, worlds: Worlds) -> Self:

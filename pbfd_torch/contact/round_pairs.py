@@ -18,7 +18,7 @@ from pbfd_torch.contact.primitives import SegmentSurface
 from pbfd_torch.contact.segments import share_of
 from pbfd_torch.contact.surface import Tangent
 from pbfd_torch.tensors.constants import indices
-from pbfd_torch.tensors.vectors import applied, dot_of_rows, in_frames
+from pbfd_torch.tensors.vectors import applied, dot, in_frames
 from pbfd_torch.tensors.worlds import replaced
 
 
@@ -111,16 +111,16 @@ def _places(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     """Where on the segment ab, as shares of it `[*, 3]`: the point nearest to the segment cd, and the two ends of what lies beside
     cd."""
     u, v, w = b - a, d - c, a - c
-    uu, uv, vv, uw, vw = (dot_of_rows(x, y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    uu, uv, vv, uw, vw = (dot(x, y) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
     s = share_of(uv * vw - vv * uw, uu * vv - uv * uv)
     t = share_of(vw + s * uv, vv)
     s = share_of(t * uv - uw, uu)
-    beside = [share_of(dot_of_rows(point - a, u), uu) for point in (c, d)]
+    beside = [share_of(dot(point - a, u), uu) for point in (c, d)]
     return torch.stack((s, *beside), -1)
 
 
 def _distance(points: Tensor, start: Tensor, end: Tensor) -> Tensor:
     """Distances of points from segments, `[*]`."""
     along = end - start
-    share = share_of(dot_of_rows(points - start, along), dot_of_rows(along, along))
+    share = share_of(dot(points - start, along), dot(along, along))
     return torch.linalg.vector_norm(points - start - share[..., None] * along, dim=-1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import axis, dot_of_rows, outer, unit
+from pbfd_torch.tensors.vectors import axis, dot, outer, unit
 
 
 def share_of(along: Tensor, square: Tensor) -> Tensor:
@@ -19,8 +19,8 @@ def from_segment(points: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Te
     length), and `[*]` which points lie beside the segment, not beyond its ends."""
     along = end - start
     direction, _ = unit(along, axis(2, along))
-    length = dot_of_rows(along, direction)
-    ahead = dot_of_rows(points - start, direction)
+    length = dot(along, direction)
+    ahead = dot(points - start, direction)
     nearest = start + torch.minimum(ahead.clamp_min(0), length)[..., None] * direction
     return points - nearest, direction, (ahead > 0) & (ahead < length)
 

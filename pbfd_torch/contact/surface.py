@@ -144,13 +144,13 @@ class Tangent:
         share, slope = x * x * x * (10 - x * (15 - 6 * x)), 30 * (x * (1 - x)).square() / layer  # twice differentiable
         above = own.distance - height
         along = 1 - share + slope * above
-        normal = torch.addcmul(share[..., None] * own.normal, along[..., None], self.normal)
+        normal = share[..., None] * own.normal + along[..., None] * self.normal
 
         def curvature() -> Tensor:
             bend = 60 * x * (1 - x) * (1 - 2 * x) / layer.square() * above
             turning = slope[..., None] * (own.normal - self.normal) + 0.5 * bend[..., None] * self.normal
             turned = outer(self.normal, turning)
-            return torch.addcmul(turned + turned.mT, share[..., None, None], own.curvature)
+            return turned + turned.mT + share[..., None, None] * own.curvature
 
         return Field(own.distance - (1 - share) * above, normal, curvature, exact=False)
 

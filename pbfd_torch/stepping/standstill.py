@@ -28,7 +28,7 @@ def departing(articulation: Articulation, integrator: Integrator[S], state: S, d
     fit = near(state.q) & slow(integrator.velocity(articulation, state, dt), articulation.topology.turns, dt)
     if control is not None:
         fit = fit & torch.isfinite(control).all(-1)
-    return state if _all(fit) else replaced(state, q=torch.where(fit[..., None], state.q, torch.nan))
+    return replaced(state, q=torch.where(fit[..., None], state.q, torch.nan))
 
 
 def arrived(
@@ -37,8 +37,6 @@ def arrived(
     """The end of a step from a state, and its solution, with worlds that got lost back in that state; their time goes on."""
     fit = near(end.q) & torch.isfinite(integrator.velocity(articulation, end, dt)).all(-1)
     fit = fit & (solution.status != int(Status.NON_FINITE))
-    if _all(fit):
-        return end, solution
     still = replaced(
         state, time=end.time, hazards=torch.zeros_like(end.hazards), memory=state.memory or end.memory, **_blank(state, end)
     )
@@ -50,8 +48,3 @@ def _blank(state: State, end: State) -> dict[str, Tensor]:
     """What a state does not hold yet, and its step's end does, as zeros."""
     ends = {field.name: getattr(end, field.name) for field in dataclasses.fields(end) if getattr(state, field.name) is None}
     return {name: torch.zeros_like(x) for name, x in ends.items() if x is not None}
-
-
-def _all(fit: Tensor) -> bool:
-    """Whether all are known to be: what is in the host's own memory it may look at; asking a device would make it wait."""
-    return fit.device.type == "cpu" and bool(fit.all())

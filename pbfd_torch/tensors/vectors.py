@@ -1,11 +1,6 @@
 """Products of small vectors and matrices, one or many at a time.
 
-Vectors `[*, n, 3]` of many points are best laid out in memory coordinate by coordinate, as transposes of `[*, 3, n]`: torch is
-several times faster where neighbours in memory belong to neighbouring points. `cross`, `extended`, `turned` and `mapped` return
-such vectors.
-
-M v has three forms, which round differently: `turned` for many points, `rotated` where a row must not depend on the batch it is in,
-and `applied` for the rest.
+M v has two forms, which round differently: `rotated`, where a row must not depend on the batch it is in, and `applied`.
 """
 
 from __future__ import annotations
@@ -19,13 +14,6 @@ _NEGLIGIBLE = 1e-15  # shorter vectors have no direction; its square and that of
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """a · b, `[*, k], [*, k] → [*]`."""
     return (a * b).sum(-1)
-
-
-def dot_of_rows(a: Tensor, b: Tensor) -> Tensor:
-    """a · b, `[*, 3], [*, 3] → [*]`. Term by term, which rounds as `dot` does: several times faster for many vectors that lie in
-    memory row by row, and slower for few."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return ax * bx + ay * by + az * bz
 
 
 def outer(a: Tensor, b: Tensor) -> Tensor:
@@ -54,16 +42,9 @@ def rotated(matrix: Tensor, vector: Tensor) -> Tensor:
     return dot(matrix, vector[..., None, :])
 
 
-def turned(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """M v, `[*, n or 1, 3, 3], [*, n, 3] → [*, n, 3]`; not by a matrix product, which is slow for so small ones."""
-    first, second, third = matrices.movedim(-3, -1).unbind(-2)
-    x, y, z = vectors.mT.split(1, -2)
-    return torch.addcmul(torch.addcmul(first * x, second, y), third, z).mT
-
-
 def mapped(frames: Tensor, points: Tensor) -> Tensor:
     """M p̄ = R p + t, `[*, n or 1, 3, 4], [*, n, 3] → [*, n, 3]`."""
-    return turned(frames[..., :3], points) + frames[..., 3]
+    return rotated(frames[..., :3], points) + frames[..., 3]
 
 
 def in_frames(frames: Tensor, points: Tensor) -> Tensor:
@@ -73,18 +54,7 @@ def in_frames(frames: Tensor, points: Tensor) -> Tensor:
 
 def extended(points: Tensor) -> Tensor:
     """p̄ = (p, 1), `[*, n, 3] → [*, n, 4]`."""
-    return torch.cat((points.mT, torch.ones_like(points.mT[..., :1, :])), -2).mT
-
-
-def cross(a: Tensor, b: Tensor) -> Tensor:
-    """a × b, `[*, n, 3], [*, n, 3] → [*, n, 3]`."""
-    return torch.stack(cross_coordinates(a, b), -2).mT
-
-
-def cross_coordinates(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The coordinates of a × b, `[*, 3], [*, 3] → [*]` each."""
-    (ax, ay, az), (bx, by, bz) = a.unbind(-1), b.unbind(-1)
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return torch.cat((points, torch.ones_like(points[..., :1])), -1)
 
 
 def unit(vector: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:

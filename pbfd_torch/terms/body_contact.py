@@ -28,6 +28,7 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive
 from pbfd_torch.terms.contact_laws import ContactLaws, ContactPoints, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
+from pbfd_torch.terms.grouping import belonging, summed
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.touching import ContactForce, Touching
 from pbfd_torch.tree.kinematics import Motion, Placement
@@ -222,11 +223,7 @@ class BodyContact(ContactLaws[PreparedBodyContact]):
     def load(self, prepared: PreparedBodyContact, placement: Placement) -> LinkLoad:
         slots, contact = prepared.slots, self.force(prepared, placement)
         links = placement.poses.shape[-3]
-        index = torch.arange(links, device=slots.first.device)[:, None]
-        on_first, on_second = ((index == x[..., None, :]).to(contact.force.dtype) for x in (slots.first, slots.second))
-
-        def summed(on: Tensor, blocks: Tensor) -> Tensor:
-            return (on @ blocks.flatten(-2)).unflatten(-1, blocks.shape[-2:])
+        on_first, on_second = (belonging(x, links, contact.force) for x in (slots.first, slots.second))
 
         @functools.cache
         def blocks() -> tuple[Tensor, Tensor, Tensor]:

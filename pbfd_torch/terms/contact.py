@@ -24,18 +24,17 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.shapes import broadcast_shapes
-from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, turned
+from pbfd_torch.tensors.vectors import applied, extended, mapped, outer, rotated
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
 from pbfd_torch.terms.firmness import deepest
 from pbfd_torch.terms.friction_law import FrictionLaw
-from pbfd_torch.terms.grouping import Grouping
-from pbfd_torch.terms.inertia import inertia_stiffness
+from pbfd_torch.terms.grouping import belonging, summed
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.normal_force import NormalForce, default_stiffness
 from pbfd_torch.terms.restitution import Restitution
-from pbfd_torch.terms.touching import ContactForce, Touching, arm
+from pbfd_torch.terms.touching import ContactForce, Touching
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Motion, Placement
 from pbfd_torch.tree.rotations import quaternion_matrix, rotation_log
@@ -139,20 +138,19 @@ class Contact(ContactLaws[PreparedContact]):
                 f"a parameter of the normal force or the friction has {shape[-1]} entries for {count} candidates: must be one "
                 f"number or end in ({count},), or (1,) where each world has its own"
             )
-        _ = self.rounded, self.grouping  # found here, so that no step has to wait for them
+        _ = self.rounded  # found here, so that no step has to wait for it
 
     @fact("radius")
     def rounded(self) -> bool:
         """Whether any candidate has a radius, so that rolling matters."""
         return bool((self.radius > 0).any())
 
-    @fact("link")
-    def grouping(self) -> Grouping:
-        """The candidates by their links."""
-        return Grouping(self.link)
-
     def _centers(self, poses: Tensor) -> Tensor:
-        return self.grouping.mapped(poses, self.position)
+        return mapped(self._of_links(poses[..., :3, :]), self.position)
+
+    def _of_links(self, matrices: Tensor) -> Tensor:
+        """To each candidate what its link has, `[*, nlink, r, c] → [*, npoint, r, c]`."""
+        return matrices[..., self.link, :, :]
 
     def memory(self, batch: tuple[int, ...]) -> Tensor:
         """What the anchors are behind by in the solid's frame at a fresh start, `[*batch, npoint, 3]`; without anchors nothing,
@@ -175,7 +173,7 @@ class Contact(ContactLaws[PreparedContact]):
             centers = centers + dt[..., None] * (frame[..., :3] @ self.carrier.belt[:, None]).squeeze(-1)
         anchor = None
         if self._anchors:
-            anchor = memory if frame is None else turned(frame[..., :3], memory)
+            anchor = memory if frame is None else rotated(frame[..., :3], memory)
         surface = self.surface
         free = functools.cache(lambda: self._centers(step.target_poses))
         if math.isfinite(self.thickness):
@@ -224,7 +222,7 @@ class Contact(ContactLaws[PreparedContact]):
             return prepared.centers.new_zeros((*prepared.centers.shape[:-2], 0, 3))  # a view would keep all of them
         at = self.touching(prepared, placement)
         kept = self._anchors.kept(at.slip, at.depth)
-        return kept if prepared.frame is None else turned(prepared.frame[..., :3].mT, kept)
+        return kept if prepared.frame is None else rotated(prepared.frame[..., :3].mT, kept)
 
     def take(self, worlds: Worlds) -> Self:
         """The same contact with the values of some worlds."""
@@ -248,7 +246,7 @@ class Contact(ContactLaws[PreparedContact]):
         field = prepared.surface.field(seen(frame, centers))
         normal, bend = field.direction, None if field.flat else lambda: field.bend
         if frame is not None:
-            normal = turned(frame[..., :3], normal)
+            normal = rotated(frame[..., :3], normal)
             bend = None if field.flat else lambda: frame[..., :3] @ field.bend @ frame[..., :3].mT
         depth, moved = prepared.raised(self._depth(field, frame, placement.poses[..., :3, :3])), centers - prepared.centers
         if prepared.anchor is not None:
@@ -256,38 +254,24 @@ class Contact(ContactLaws[PreparedContact]):
         radius = turn = None
         if self.rounded:
             radius = self.radius
-            turn = self.grouping.picked(rotation_log(placement.poses[..., :3, :3] @ prepared.rotations.mT))
+            turn = rotation_log(placement.poses[..., :3, :3] @ prepared.rotations.mT)[..., self.link, :]
         return Touching(centers, normal, depth, moved, radius, turn, bend, field.steepness)
 
     def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         contact = self.force(prepared, placement)
-        links, grouping = placement.poses.shape[-3], self.grouping
-        at = contact.at
-        flat = at.bend is None and not self.rounded
-        ends = extended(grouping.rows(at.points))
-
-        def stiffness() -> Tensor:
-            if not flat:
-                return grouping.spread(grouping.sums(contact.stiffness().flatten(-2)).unflatten(-1, (6, 6)), links)
-            summed = torch.zeros_like(ends[..., :1, :1])
-            for pair in contact.factors():
-                summed = summed + grouping.products(*(arm(ends[..., :3], grouping.rows(x)) for x in pair))
-            if contact.drag is not None:
-                summed = summed + inertia_stiffness(grouping.products(grouping.rows(contact.drag[..., None]) * ends, ends))
-            return grouping.spread(summed, links)
-
-        moment = -grouping.products(grouping.rows(contact.force), ends)
+        on = belonging(self.link, placement.poses.shape[-3], contact.force)
+        moment = -summed(on, outer(contact.force, extended(contact.at.points)))
         outlook = functools.partial(self._outlook, contact)
-        return LinkLoad(grouping.spread(moment, links), stiffness, outlook=outlook)
+        return LinkLoad(moment, lambda: summed(on, contact.stiffness()), outlook=outlook)
 
     def _outlook(self, contact: ContactForce, motion: Motion) -> Callable[[Tensor], Tensor]:
-        velocity = self.grouping.mapped(motion.rates, self.position)
-        acceleration = self.grouping.mapped(motion.accelerations, self.position)
+        velocity = mapped(self._of_links(motion.rates), self.position)
+        acceleration = mapped(self._of_links(motion.accelerations), self.position)
         if self.rounded:  # as in the slip: the surface moves by φ × s beside its centre
             out = contact.at.centers - contact.at.points
-            spin = self.grouping.picked(motion.twists[..., :3])
-            velocity = velocity - cross(spin, out)
-            acceleration = acceleration - cross(self.grouping.picked(motion.drifts[..., :3]), out)
+            spin = motion.twists[..., self.link, :3]
+            velocity = velocity - torch.linalg.cross(spin, out)
+            acceleration = acceleration - torch.linalg.cross(motion.drifts[..., self.link, :3], out)
             if (bulge := contact.at.bulge(spin)) is not None:
                 acceleration = acceleration - bulge[..., None] * contact.at.normal
         return contact_outlook(contact, velocity, acceleration)
@@ -314,4 +298,4 @@ class Contact(ContactLaws[PreparedContact]):
 
 def seen(frame: Tensor | None, points: Tensor) -> Tensor:
     """World points in a frame `[*batch, 1, 3, 4]`, or themselves."""
-    return points if frame is None else turned(frame[..., :3].mT, points - frame[..., 3])
+    return points if frame is None else rotated(frame[..., :3].mT, points - frame[..., 3])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from pbfd_torch.tensors.vectors import dot, rotated
@@ -22,8 +21,8 @@ def contact_outlook(force: ContactForce, velocity: Tensor, acceleration: Tensor)
     sinks, faster = -dot(velocity, at.normal), -dot(acceleration, at.normal)
     if law is not None:
         slip = at.slip
-        first = torch.addcmul(velocity, sinks[..., None], at.normal)
-        second = torch.addcmul(acceleration, faster[..., None], at.normal)
+        first = velocity + sinks[..., None] * at.normal
+        second = acceleration + faster[..., None] * at.normal
         size, along, square = dot(slip, slip), dot(slip, first), dot(first, first) + dot(slip, second)
         cube, fourth = dot(first, second), dot(second, second)
     if at.bend is not None:

@@ -22,7 +22,7 @@ from pbfd_torch.contact.surface import Field
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
-from pbfd_torch.tensors.vectors import applied, turned
+from pbfd_torch.tensors.vectors import applied, rotated
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact import Contact, PreparedContact, seen
 from pbfd_torch.terms.firmness import deepest
@@ -152,4 +152,4 @@ class CurvedContact(Contact):
 
 def _out(field: Field, frame: Tensor | None) -> Tensor:
     """Normals in the world."""
-    return field.direction if frame is None else turned(frame[..., :3], field.direction)
+    return field.direction if frame is None else rotated(frame[..., :3], field.direction)

@@ -15,6 +15,7 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative, require_positive, require_widening
 from pbfd_torch.terms.contact import Contact, PreparedContact
 from pbfd_torch.terms.coulomb_friction import slip_factor, slip_factor_slope, slip_work
+from pbfd_torch.terms.grouping import belonging, summed
 from pbfd_torch.terms.load import LinkLoad, StepContext
 from pbfd_torch.terms.touching import Touching, shifting
 from pbfd_torch.tree.kinematics import Placement
@@ -78,7 +79,7 @@ class TorsionalFriction:
 
     def load(self, prepared: PreparedContact, placement: Placement) -> LinkLoad:
         at, turn, limit, by_depth, angle = self._at(prepared, placement)
-        links, grouping = placement.poses.shape[-3], self.contact.grouping
+        on = belonging(self.contact.link, placement.poses.shape[-3], limit)
         width = self.spin_speed * prepared.dt
         size = angle.abs()
         factor = slip_factor(size, width)
@@ -97,12 +98,10 @@ class TorsionalFriction:
                 answer = answer + (limit * factor * angle)[..., None, None] * (at.bend() @ shift)
             # the assembly takes the torque for one of forces on material points, whose curvature is ½[τ]× more on either side
             answer = answer - 0.5 * torch.cat((skew(torque), torch.zeros_like(answer[..., 3:])), -1)
-            whole = torch.cat((answer, torch.zeros_like(answer)), -2)
-            return grouping.spread(grouping.sums(whole.flatten(-2)).unflatten(-1, (6, 6)), links)
+            return summed(on, torch.cat((answer, torch.zeros_like(answer)), -2))
 
-        summed = grouping.sums(torque)
-        moment = torch.cat((-0.5 * skew(summed), torch.zeros_like(summed)[..., None]), -1)
-        return LinkLoad(grouping.spread(moment, links), stiffness)
+        moment = torch.cat((-0.5 * skew(torque), torch.zeros_like(torque)[..., None]), -1)
+        return LinkLoad(summed(on, moment), stiffness)
 
     def energy(self, prepared: PreparedContact, placement: Placement) -> Tensor:
         """ℓ μ N̂ S(|y|) [J] `[*batch]`, S as in `slip_work`, where the friction is lagged, else none. Its gradient is the torque but

@@ -3,11 +3,7 @@
 A candidate is a centre c on a body, a radius ρ ≥ 0 and a margin δ ≥ 0, beside a solid with signed distance φ, whose gradient there
 has the direction n. Its depth is d = ρ + δ − φ(c), and its force acts at p = c − ρn. Over the step it slips by u = (1 − nnᵀ)m,
 m = c − c₀ − ρ ϕ × n + a (METHOD §4): c₀ is where the solid has carried the centre of the start, ϕ the rotation since then relative
-to the solid, and a what an anchor remembers. Everything is in world axes; what moves below is the body, relative to the solid.
-
-Vectors of many candidates are laid out coordinate by coordinate (`tensors.vectors`). In sums the slip goes first and the normal
-last: torch lays a result out like its first operand, and planes have one normal for all.
-"""
+to the solid, and a what an anchor remembers. Everything is in world axes; what moves below is the body, relative to the solid."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import cross, cross_coordinates, dot, outer, rows, trace_minus
+from pbfd_torch.tensors.vectors import dot, outer, rows, trace_minus
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
@@ -71,12 +67,12 @@ class Touching:
         """m `[*, n, 3]`."""
         if self.radius is None or self.turn is None:
             return self.moved
-        return self.moved - self.radius[..., None] * cross(self.turn, self.normal)
+        return self.moved - self.radius[..., None] * torch.linalg.cross(self.turn, self.normal)
 
     @cached_property
     def slip(self) -> Tensor:
         """u `[*, n, 3]` [m]."""
-        return torch.addcmul(self.travel, dot(self.travel, self.normal)[..., None], self.normal, value=-1)
+        return self.travel - dot(self.travel, self.normal)[..., None] * self.normal
 
     @cached_property
     def size(self) -> Tensor:
@@ -170,7 +166,7 @@ class ContactForce:
         """f `[*, n, 3]` on the body [N]."""
         if self.drag is None:
             return self.normal[..., None] * self.at.normal
-        return torch.addcmul(-self.drag[..., None] * self.at.slip, self.normal[..., None], self.at.normal)
+        return self.normal[..., None] * self.at.normal - self.drag[..., None] * self.at.slip
 
     def energy(self) -> Tensor:
         """Stored energy (Eq. 9) and the friction's, where it is a gradient, `[*, n]` [J]."""
@@ -221,25 +217,6 @@ class ContactForce:
         at, answer = self.at, self.answer()
         torque, wandering = skew(at.points) @ answer, at.wandering(self.force)
         return torch.cat((torque if wandering is None else torque + wandering, answer), -2)
-
-    def factors(self) -> list[tuple[Tensor, Tensor]]:
-        """`stiffness` of points at flat solids as a sum of products of `arm(c, l)` and `arm(c, r)`: the pairs l, r `[*, n, 3]`. The
-        part G XᵀX with X = `shifting(c)` is left to the second moments of G."""
-        at = self.at
-        by_depth, by_size = self._normal_slopes
-        if self._drag_slopes is None:
-            return [(by_depth[..., None] * at.normal, at.normal)]
-        drag, drag_by_depth, drag_by_size = self._drag_slopes
-        first = torch.addcmul(-drag_by_depth[..., None] * at.slip, (by_depth - drag)[..., None], at.normal)
-        second = drag_by_size[..., None] * at.slip
-        if by_size is not None:
-            second = torch.addcmul(second, by_size[..., None], at.normal, value=-1)
-        return [(first, at.normal), (second, at.slip)]
-
-
-def arm(points: Tensor, forces: Tensor) -> Tensor:
-    """Wrench (p × f, f) about the world origin, `[*, 3], [*, 3] → [*, 6]`."""
-    return torch.stack((*cross_coordinates(points, forces), *forces.unbind(-1)), -2).mT
 
 
 def shifting(points: Tensor) -> Tensor:

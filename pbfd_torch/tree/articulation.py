@@ -19,11 +19,10 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError, ModelError
-from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.shapes import broadcast_shapes
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.bounds import HEAVIEST, LIGHTEST, MASSES
-from pbfd_torch.tree.rotations import quaternion_matrix, skew
+from pbfd_torch.tree.rotations import quaternion_matrix
 from pbfd_torch.tree.topology import Topology
 
 
@@ -168,7 +167,6 @@ class Articulation:
             if bool((torch.isnan(value) if name in ("lower", "upper") else ~torch.isfinite(value)).any()):
                 raise InputError(f"{name} holds NaN or infinity: must be finite, but for limits that do not limit")
         self._check_inertia()
-        self.joint_basis()  # kept from now on: nothing of a step, which a device may record and repeat, makes it for later ones
 
     def _check_inertia(self) -> None:
         with torch.no_grad():
@@ -234,29 +232,6 @@ class Articulation:
     def joint_index(self, name: str) -> int:
         """Index of a joint by name; raises `InputError` with the valid names."""
         return _index(name, self.joint_names, "joint")
-
-    def joint_basis(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Hinge and slide joints' placement on their previous node is C + a·E₁ + b·E₂, each `[*, nscalar, 4, 4]`:
-        (a, b) = (sin x, 1 − cos x) for a hinge and (x, 0) for a slide at x = q − ref (Rodrigues' formula)."""
-        differentiable = torch.is_grad_enabled() and (self.joint_frame.requires_grad or self.joint_axis.requires_grad)
-        return self._compute_basis() if differentiable else self._cached_basis
-
-    @fact("topology", "joint_frame", "joint_axis")
-    def _cached_basis(self) -> tuple[Tensor, Tensor, Tensor]:
-        with torch.no_grad():
-            return self._compute_basis()
-
-    def _compute_basis(self) -> tuple[Tensor, Tensor, Tensor]:
-        t = self.topology
-        frame = self.joint_frame[..., t.scalar_joint, :, :]
-        axis = self.joint_axis[..., t.scalar_joint, :]
-        k = skew(axis)
-        hinge = t.scalar_is_hinge[:, None, None]
-        column = torch.zeros_like(axis)[..., None]
-        turn = torch.nn.functional.pad(torch.cat((k, column), -1), (0, 0, 0, 1))
-        turn2 = torch.nn.functional.pad(torch.cat((k @ k, column), -1), (0, 0, 0, 1))
-        shift = torch.nn.functional.pad(axis[..., None], (3, 0, 0, 1))
-        return frame, frame @ torch.where(hinge, turn, shift), frame @ torch.where(hinge, turn2, torch.zeros_like(turn2))
 
 
 def force_scale(articulation: Articulation, gravity: float | Tensor) -> Tensor:

@@ -88,11 +88,8 @@ def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
     groups = []
     if len(t.scalar_joint):
         x = q[..., t.scalar_q] - articulation.joint_ref[..., t.scalar_joint]
-        half_sine = torch.sin(0.5 * x)
-        a = torch.where(t.scalar_is_hinge, torch.sin(x), x)[..., None, None]
-        b = (2 * half_sine * half_sine)[..., None, None]  # 1 − cos x without cancellation; E₂ is zero for slides
-        constant, first, second = articulation.joint_basis()
-        groups.append(constant + a * first + b * second)
+        moved = scalar_motion(articulation.joint_axis[..., t.scalar_joint, :], t.scalar_is_hinge, x)
+        groups.append(articulation.joint_frame[..., t.scalar_joint, :, :] @ moved)
     if len(t.turning_joint):
         position = q.new_zeros((*q.shape[:-1], len(t.turning_joint), 3))
         if len(t.free_q):
@@ -104,6 +101,17 @@ def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
     batch = broadcast_shapes(*(g.shape[:-3] for g in groups))
     local = torch.cat([g.expand(*batch, *g.shape[-3:]) for g in groups], -3)
     return local if t.node_order is None else local[..., t.node_order, :, :]
+
+
+def scalar_motion(axis: Tensor, hinge: Tensor, x: Tensor) -> Tensor:
+    """What a hinge turns and a slide shifts along a unit axis `[*, n, 3]` at x `[*, n]` [rad or m], `[*, n, 4, 4]`; hinge: `[n]`
+    bool."""
+    k = skew(axis)
+    half_sine = torch.sin(0.5 * x)
+    sine, versine = (torch.where(hinge, y, 0.0)[..., None, None] for y in (torch.sin(x), 2 * half_sine * half_sine))
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    turn = eye + sine * k + versine * (k @ k)  # Rodrigues; 1 − cos x without cancellation
+    return homogeneous(turn, torch.where(hinge, 0.0, x)[..., None] * axis)
 
 
 def node_poses(articulation: Articulation, q: Tensor) -> Tensor:
