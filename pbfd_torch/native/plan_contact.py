@@ -34,6 +34,7 @@ KINDS = (
     *((solid, BALL) for solid in CONVEX + UNEVEN),
     *((solid, ELLIPSOID) for solid in UNEVEN),  # on convex ones they touch as convex bodies do (terms/contact_terms.py)
 )
+SOLIDS = (Plane, *CONVEX, *UNEVEN)
 GRIP = 4  # which of the numbers of a candidate μ is
 PLANAR = 2  # of them, the first: what the core knows in a plane
 
@@ -174,6 +175,8 @@ class Candidates:
     def _solid(self, a: Articulation, term: Contact, name: str, moves: bool) -> int:
         """Adds what is touched, in its own frame if that moves; its number."""
         surface = term.surface
+        if type(surface) not in SOLIDS:
+            raise unknown(f"contact with '{name}', which is a {type(surface).__name__}")
         frame = torch.eye(4, dtype=a.dtype) if moves or term.carrier is None else term.carrier.start
         if isinstance(surface, Plane) and (moves or term.carrier is None):
             self.planes.append(joined(_one(surface.normal, 1, name), _one(surface.offset, 0, name)))
@@ -200,8 +203,6 @@ class Candidates:
                 sizes, grid = [surface.origin, surface.spacing], self._sampled(surface.coefficients)
             case DistanceGrid():
                 sizes, grid = [surface.origin, surface.spacing.reshape(1)], self._sampled(surface.coefficients)
-            case _:
-                raise unknown(f"contact with '{name}', which is a {type(surface).__name__}")
         self.grids += grid
         placed = joined(frame[..., :3, :3].flatten(-2), frame[..., :3, 3])
         size = torch.nn.functional.pad(known := joined(*sizes), (0, 6 - known.shape[-1]))
