@@ -1,8 +1,31 @@
 // Uniform cubic B-splines through samples, as contact/splines.py: every lane gathers its own coefficients.
 #pragma once
 #include "candidates.h"
+#include "target.h"
 
 namespace pbfd {
+
+// Σ_j w[j] values[K j + k], k < K. One world's are found side by side in a register, to the bit the same.
+template <int K, class V> inline void contract(const V* w, const V* values, V* out) {
+  if constexpr (Kind<V>::lanes == 1) {
+    constexpr int REGISTER = register_bytes / int(sizeof(V)), W = K < REGISTER ? K : REGISTER;
+    using Wide = Lanes<V, W>;
+    auto read = [](const V* from) {
+      Wide x;
+      for (int i = 0; i < W; i++) put(x, i, from[i]);
+      return x;
+    };
+    for (int k = 0; k < K; k += W) {
+      const V* first = values + k;
+      const Wide last = Wide(w[3]) * read(first + 3 * K);
+      const Wide sum = fma(Wide(w[0]), read(first), fma(Wide(w[1]), read(first + K), fma(Wide(w[2]), read(first + 2 * K), last)));
+      for (int i = 0; i < W; i++) out[k + i] = lane(sum, i);
+    }
+  } else {
+    for (int k = 0; k < K; k++)
+      out[k] = fma(w[0], values[k], fma(w[1], values[K + k], fma(w[2], values[2 * K + k], w[3] * values[3 * K + k])));
+  }
+}
 
 // A place within the cells along one axis: the cell, and the basis and its derivatives there, [4] each.
 template <int ORDER, class V> struct Basis {
@@ -32,9 +55,9 @@ template <int ORDER, class V> struct Basis {
     const int first = int(lane(clamped(cell, V(-3), V(size)), i));
     for (int j = 0; j < 4; j++) out[j] = first + j < 0 ? 0 : first + j < size ? first + j : size - 1;
   }
-  V along(int order, const V* values, int stride) const {
+  V along(int order, const V* values) const {
     const V* x = w[order];
-    return fma(x[0], values[0], fma(x[1], values[stride], fma(x[2], values[2 * stride], x[3] * values[3 * stride])));
+    return fma(x[0], values[0], fma(x[1], values[1], fma(x[2], values[2], x[3] * values[3])));
   }
 };
 
@@ -51,8 +74,8 @@ inline void spline(const typename Kind<V>::Scalar* sample, const int* size, cons
     }
   }
   for (int a = 0; a <= ORDER; a++) {
-    for (int k = 0; k < 4; k++) columns[k] = x.along(a, values + k, 4);
-    for (int b = 0; a + b <= ORDER; b++) D[a][b] = y.along(b, columns, 1);
+    contract<4>(x.w[a], values, columns);
+    for (int b = 0; a + b <= ORDER; b++) D[a][b] = y.along(b, columns);
   }
 }
 
@@ -72,10 +95,10 @@ inline void spline(
       }
   }
   for (int a = 0; a <= ORDER; a++) {
-    for (int k = 0; k < 16; k++) sheets[k] = x.along(a, values + k, 16);
+    contract<16>(x.w[a], values, sheets);
     for (int b = 0; a + b <= ORDER; b++) {
-      for (int k = 0; k < 4; k++) columns[k] = y.along(b, sheets + k, 4);
-      for (int c = 0; a + b + c <= ORDER; c++) D[a][b][c] = z.along(c, columns, 1);
+      contract<4>(y.w[b], sheets, columns);
+      for (int c = 0; a + b + c <= ORDER; c++) D[a][b][c] = z.along(c, columns);
     }
   }
 }
