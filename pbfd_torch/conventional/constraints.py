@@ -17,7 +17,7 @@ from pbfd_torch.tensors.vectors import dot
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import DryFriction
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
-from pbfd_torch.terms.touching import Touching, arm
+from pbfd_torch.terms.touching import Touching
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement
 
@@ -69,7 +69,7 @@ def contact_constraints(
     at = contact.touching(prepared, placement)
     frame = contact_frame(at.normal)
     topology = placement.articulation.topology
-    arms = arm(at.points[..., None, :], frame)
+    arms = torch.cat((torch.linalg.cross(at.points[..., None, :], frame), frame), -1)
     rows = (arms.flatten(-3, -2) @ placement.axes.mT).unflatten(-2, arms.shape[-3:-1])
     rows = rows * topology.moves_link[contact.link].to(rows.dtype)[:, None]
     slid = dot(frame[..., 1:, :], at.travel[..., None, :]) / dt[..., None, None]
