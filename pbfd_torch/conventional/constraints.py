@@ -69,7 +69,7 @@ def contact_constraints(
     at = contact.touching(prepared, placement)
     frame = contact_frame(at.normal)
     topology = placement.articulation.topology
-    arms = torch.cat((torch.linalg.cross(at.points[..., None, :].expand_as(frame), frame), frame), -1)  # wrenches about the origin
+    arms = torch.cat((torch.linalg.cross(at.points[..., None, :], frame), frame), -1)
     rows = (arms.flatten(-3, -2) @ placement.axes.mT).unflatten(-2, arms.shape[-3:-1])
     rows = rows * topology.moves_link[contact.link].to(rows.dtype)[:, None]
     slid = dot(frame[..., 1:, :], at.travel[..., None, :]) / dt[..., None, None]

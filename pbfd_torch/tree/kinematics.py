@@ -88,8 +88,8 @@ def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
     groups = []
     if len(t.scalar_joint):
         x = q[..., t.scalar_q] - articulation.joint_ref[..., t.scalar_joint]
-        moved = scalar_motion(articulation.joint_axis[..., t.scalar_joint, :], t.scalar_is_hinge, x)
-        groups.append(articulation.joint_frame[..., t.scalar_joint, :, :] @ moved)
+        frame = articulation.joint_frame[..., t.scalar_joint, :, :]
+        groups.append(frame + frame @ scalar_motion(articulation.joint_axis[..., t.scalar_joint, :], t.scalar_is_hinge, x))
     if len(t.turning_joint):
         position = q.new_zeros((*q.shape[:-1], len(t.turning_joint), 3))
         if len(t.free_q):
@@ -104,14 +104,14 @@ def _local_poses(articulation: Articulation, q: Tensor) -> Tensor:
 
 
 def scalar_motion(axis: Tensor, hinge: Tensor, x: Tensor) -> Tensor:
-    """What a hinge turns and a slide shifts along a unit axis `[*, n, 3]` at x `[*, n]` [rad or m], `[*, n, 4, 4]`; hinge: `[n]`
-    bool."""
+    """M − 1 `[*, n, 4, 4]`, M the motion by x `[*, n]` [rad or m] about or along a unit axis `[*, n, 3]`; hinge: `[n]` bool. With
+    the 1 small motions would be rounded."""
     k = skew(axis)
     half_sine = torch.sin(0.5 * x)
     sine, versine = (torch.where(hinge, y, 0.0)[..., None, None] for y in (torch.sin(x), 2 * half_sine * half_sine))
-    eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    turn = eye + sine * k + versine * (k @ k)  # Rodrigues; 1 − cos x without cancellation
-    return homogeneous(turn, torch.where(hinge, 0.0, x)[..., None] * axis)
+    turn = sine * k + versine * (k @ k)  # Rodrigues; 1 − cos x without cancellation
+    shift = torch.where(hinge, 0.0, x)[..., None] * axis
+    return torch.nn.functional.pad(torch.cat((turn, shift[..., None]), -1), (0, 0, 0, 1))
 
 
 def node_poses(articulation: Articulation, q: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ template <class V, class N, int D> struct Contacts {
   V per_dt;
   V* share;  // of its normal force that a candidate gives
   V* bounce;  // [uncommon] how far its solid is moved out, of those that throw candidates back
+  V* began_at;  // how deep it was at the step's start, beside solids that are not flat, where that is dear
   V* guard;  // [2 + D] 1 where a plane stands for the solid, else 0, and its normal and offset
   // of the nodes at a configuration: the rotation since the start and how it answers a turn, where asked for
   Poses<V> now;
@@ -32,11 +33,11 @@ template <class V, class N, int D> struct Contacts {
   int turning, turned_on;
 
   static int room(Sizes s) {
-    return (3 + D) * s.candidates + s.uncommon + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
+    return (4 + D) * s.candidates + s.uncommon + T * (1 + T) * s.nodes + (s.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V));
   }
   Contacts(const Plan<N, D>& scene, const Relaxed<V>& easier, const Laws<V, N, D>& all, Carriers<V>& moving, Arena<V>& arena)
       : plan(scene), candidates(scene.contact), relaxed(easier), laws(all), carriers(moving) {
-    share = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
+    share = arena.take(plan.candidates), began_at = arena.take(plan.candidates), guard = arena.take((2 + D) * plan.candidates);
     bounce = arena.take(plan.uncommon);
     turned_by = arena.take(T * plan.nodes), rollings = arena.take(T * T * plan.nodes);
     turned = reinterpret_cast<bool*>(arena.take((plan.nodes * int(sizeof(bool)) + int(sizeof(V)) - 1) / int(sizeof(V))));
@@ -49,7 +50,7 @@ template <class V, class N, int D> struct Contacts {
     each_kind(candidates, [&](auto pair, int first, int last) {
       using Surface = typename decltype(pair)::Surface;
       using Support = typename decltype(pair)::Support;
-      if (!Surface::convex && !Support::wanders) return;
+      if (Surface::flat && !Support::wanders) return;
       for (int i = first; i < last; i++) {
         V c[D], room[D * D];
         Beside<V, D> solid;
@@ -57,6 +58,7 @@ template <class V, class N, int D> struct Contacts {
         beside<Surface>(i, c, solid);
         if constexpr (Support::wanders) share[i] = Support::share(candidates, i, stood(i, room), solid.normal);
         if constexpr (Surface::convex) keep_outside(i, c, solid, free);
+        if constexpr (!Surface::flat) began_at[i] = sunk(pair, i, stood(i, room), solid);
       }
     });
     if (laws.throwing) throw_back(anew, free, step);
@@ -166,7 +168,7 @@ template <class V, class N, int D> struct Contacts {
       for (int i = first; i < last; i++) {
         V c[D], push, rises;
         Beside<V, D> solid;
-        const V start = began(pair, i, c, solid);
+        const V start = started(pair, i, c, solid);
         center(i, at, c);
         V firmness = V(candidates.firmness[i]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
@@ -236,6 +238,12 @@ template <class V, class N, int D> struct Contacts {
     if constexpr (Pair::Support::wanders) return depth(Pair(), i, stood(i, room), c, solid);
     return depth(Pair(), i, before, c, solid);
   }
+  // The same in the step that has begun.
+  template <class Pair> V started(Pair, int i, V* c, Beside<V, D>& solid) const {
+    if constexpr (Pair::Surface::flat) return began(Pair(), i, c, solid);
+    origin(i, c);
+    return began_at[i];
+  }
   template <class Pair> V depth(Pair, int i, const V* R, const V* c, Beside<V, D>& solid) const {
     beside<typename Pair::Surface>(i, c, solid);
     if constexpr (Pair::Surface::convex) {
@@ -271,7 +279,7 @@ template <class V, class N, int D> struct Contacts {
     const int k = candidates.carrier[i];
     V c[D];
     Beside<V, D> solid;
-    t.start = began(Pair(), i, c, solid);
+    t.start = started(Pair(), i, c, solid);
     for (int j = 0; j < D; j++) t.moved[j] = t.center[j] - c[j];
     if constexpr (D == 3)
       if (anchored(i)) {
