@@ -17,7 +17,7 @@ from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.scene import Scene
-from pbfd_torch.tensors.structures import tensors_of
+from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.inertia import Inertia
@@ -127,27 +127,40 @@ def test_long_horizon() -> None:
 
 @pytest.mark.parametrize(("name", "engine"), [*((name, None) for name in SMOOTH), ("energy-momentum", Torch())])
 def test_values_are_the_same_to_the_bit(name: str, engine: Engine | None) -> None:
-    """With and without derivatives: a chain that lands on a slope, eased and halved steps among its own, by its start, its masses
-    and its friction, with checkpoints and without."""
+    """With and without derivatives, from one state: a chain that lands on a slope, eased and halved steps among its own, by its
+    start, its masses and its friction, with checkpoints and without."""
     setup = SCENES["chain-slope-drop"](worlds=2)
     v = setup.v + torch.tensor([[0.0], [0.3]], dtype=torch.float64)
     plain = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=engine)
-    expected = plain.trajectory(plain.initial_state(setup.q, v), steps=9)
     names = ("articulation.pseudo_inertia", "terms.1.friction.mu")
     values = {n: x.clone().requires_grad_() for n, x in parameters(setup.scene).items() if n in names}
     simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name](), engine=engine)
+    given = v.clone().requires_grad_()
+    start = simulator.initial_state(setup.q, given)
+    expected = plain.trajectory(mapped_tensors(start, Tensor.detach), steps=9)
     gradients = []
     for checkpoint in (1, 4):
-        given = v.clone().requires_grad_()
-        path = simulator.trajectory(simulator.initial_state(setup.q, given), steps=9, checkpoint=checkpoint)
+        path = simulator.trajectory(start, steps=9, checkpoint=checkpoint)
         assert torch.equal(path.q, expected.q)
         assert torch.equal(path.v, expected.v)
         assert torch.equal(path.status, expected.status)
-        gradients.append(torch.autograd.grad((path.q[-1] ** 2).sum() + path.v[3].sum(), (given, *values.values())))
+        end = (path.q[-1] ** 2).sum() + path.v[3].sum()
+        gradients.append(torch.autograd.grad(end, (given, *values.values()), retain_graph=True))
     for once, again in zip(*gradients, strict=True):
         torch.testing.assert_close(once, again, rtol=1e-12, atol=1e-12 * float(once.abs().max()))
-    record = simulator.rollout(simulator.initial_state(setup.q, v), steps=9)
+    record = simulator.rollout(start, steps=9)
     assert torch.equal(record.q, expected.q)
+
+
+@all_integrators
+def test_starts_have_the_same_values(name: str) -> None:
+    """With and without derivatives: to the bit in PyTorch, which goes on from where the core's trial ends, but for rounding."""
+    setup = SCENES["chain-slope-drop"](worlds=2)
+    for engine, off in ((Torch(), 0.0), (None, 1e-10)):
+        simulator = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=engine)
+        starts = [simulator.initial_state(setup.q, v) for v in (setup.v, setup.v.clone().requires_grad_())]
+        for without, carrying in zip(*map(tensors_of, starts), strict=True):
+            torch.testing.assert_close(carrying, without, rtol=0, atol=off, equal_nan=True)
 
 
 def test_the_same_twice() -> None:
