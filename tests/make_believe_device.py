@@ -203,6 +203,11 @@ class _Device(TorchDispatchMode):
         super().__init__()  # type: ignore[no-untyped-call]
         self.tally = Tally()
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """Nothing is compiled here: to hide every operation from the compiler would take as long as to do it."""
+        return False
+
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
         tensors = _tensors([*args, *kwargs.values()])
@@ -215,16 +220,16 @@ class _Device(TorchDispatchMode):
         if len(pretenders) < len(tensors):
             self._check(operation, args, [x for x in tensors if not isinstance(x, Pretender)])
         self._note(operation, args, kwargs)
-        changed = {key: _mapped(values, x) for key, x in kwargs.items()}
+        changed = {key: _held(x) for key, x in kwargs.items()}
         if target is not None:
             changed["device"] = torch.device("cpu")
-        result = function(*[_mapped(values, x) for x in args], **changed)
+        result = function(*map(_held, args), **changed)
         if not aimed and target is not None:
             return result
         if operation.writes:  # gives back what it was given
             known = {id(x.held): x for x in pretenders}
             return _mapped(lambda x: known.get(id(x), x), result)
-        claimed = _mapped(Pretender, result)
+        claimed = Pretender(result) if type(result) is Tensor else _mapped(Pretender, result)
         if operation.name == "scalar_tensor":
             claimed.number = True
         return claimed
@@ -315,6 +320,13 @@ def _mapped(change: Callable[[Tensor], Tensor], x: Any) -> Any:
     if isinstance(x, Tensor):
         return change(x)
     return type(x)(_mapped(change, y) for y in x) if isinstance(x, list | tuple) else x
+
+
+def _held(x: Any) -> Any:
+    """An argument with the values that tensors hold, in lists too."""
+    if type(x) is Pretender:
+        return x.held
+    return type(x)(map(_held, x)) if isinstance(x, list | tuple) else x
 
 
 def _copied(name: str, args: Sequence[Any], kwargs: dict[str, Any]) -> str | None:

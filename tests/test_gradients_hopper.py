@@ -14,7 +14,6 @@ from pbfd_torch.gradients.linked import Linked, Made, Step, doubts_of
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models import SCENES
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
-from tests.gradient_checks import precise_solver
 from tests.random_trees import generator
 
 
@@ -45,7 +44,7 @@ class Hop:
 def hop() -> Hop:
     """32 steps of 8 ms from .16 s after a hopper was let go."""
     setup = SCENES["hopper"]()
-    simulator = Simulator(setup.scene, 0.008, solver=precise_solver())
+    simulator = Simulator(setup.scene, 0.008)
     start = simulator.initial_state(setup.q, setup.v)
     for _ in range(20):
         start, _ = simulator.step(start)

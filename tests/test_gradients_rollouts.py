@@ -15,9 +15,9 @@ from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.parameters import parameters, with_parameters
 from pbfd_torch.models import SCENES
-from pbfd_torch.native.engine import Torch
+from pbfd_torch.native.engine import Engine, Torch
 from pbfd_torch.scene import Scene
-from pbfd_torch.tensors.structures import tensors_of
+from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.inertia import Inertia
@@ -41,10 +41,10 @@ def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
-def along(function: Callable[[Tensor], Tensor], largest: float) -> Tensor:
-    """Central differences of a function of numbers `[m]` → `[m]` at 0, extrapolated."""
+def along(function: Callable[[Tensor], Tensor], largest: float, batch: tuple[int, ...] = ()) -> Tensor:
+    """Central differences of functions of a number each, `[m, *batch]` → `[m, *batch]`, at 0, extrapolated."""
     with torch.no_grad():
-        return derivative(lambda t: function(t.squeeze(-1)), 1, (), largest, levels=7).squeeze(-1)
+        return derivative(lambda t: function(t.squeeze(-1)), 1, batch, largest, levels=7).squeeze(-1)
 
 
 # Closed forms ---------------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def collided(start: Tensor, law: NormalForce, restitution: Restitution | None, d
     x2, v0, u0, `[m, 4]` → `[m]`. Radius .1 m, weightless."""
     scene = free_bodies((Sphere(0.1), Sphere(0.1)), (1.0, 1.0), (), mu=0.0, gravity=torch.zeros(3, dtype=torch.float64))
     terms = [replaced(t, restitution=restitution, normal_force=law) if isinstance(t, BodyContact) else t for t in scene.terms]
-    simulator = Simulator(replaced(scene, terms=tuple(terms)), dt, solver=precise_solver())
+    simulator = Simulator(replaced(scene, terms=tuple(terms)), dt)
     q = posed((0, 0, 0), (0, 0, 0)).expand(len(start), -1).clone()
     v = torch.zeros(len(start), 12, dtype=torch.float64)
     x = torch.eye(14, dtype=torch.float64)
@@ -99,9 +99,12 @@ def test_two_equal_balls(case: str) -> None:
     start = torch.tensor([[0.0, 0.503, 1.0, 0.0]], dtype=torch.float64)
     given = start.clone().requires_grad_()
     (found,) = torch.autograd.grad(collided(given, law, restitution, dt).sum(), given)
-    for k, direction in enumerate(torch.eye(4, dtype=torch.float64)):
-        expected = along(lambda t: collided(start + t[:, None] * direction, law, restitution, dt), 1e-4)  # noqa: B023
-        assert float(found[0, k]) == pytest.approx(float(expected), abs=1e-5)
+
+    def moved(t: Tensor) -> Tensor:
+        """`[m, 4]`, in each of four worlds along another one of the numbers."""
+        return collided((start + torch.diag_embed(t)).flatten(0, 1), law, restitution, dt).view_as(t)
+
+    torch.testing.assert_close(found[0], along(moved, 1e-4, (4,)), rtol=0, atol=1e-5)
     torch.testing.assert_close(found[0], torch.tensor(near, dtype=torch.float64), rtol=0, atol=most)
 
 
@@ -122,29 +125,42 @@ def test_long_horizon() -> None:
 # The same values, whatever is asked of them ---------------------------------------------------------------------------
 
 
-@all_integrators
-def test_values_are_the_same_to_the_bit(name: str) -> None:
-    """With and without derivatives: a chain that lands on a slope, eased and halved steps among its own, by its start, its masses
-    and its friction, with checkpoints and without."""
+@pytest.mark.parametrize(("name", "engine"), [*((name, None) for name in SMOOTH), ("energy-momentum", Torch())])
+def test_values_are_the_same_to_the_bit(name: str, engine: Engine | None) -> None:
+    """With and without derivatives, from one state: a chain that lands on a slope, eased and halved steps among its own, by its
+    start, its masses and its friction, with checkpoints and without."""
     setup = SCENES["chain-slope-drop"](worlds=2)
     v = setup.v + torch.tensor([[0.0], [0.3]], dtype=torch.float64)
-    plain = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=Torch())
-    expected = plain.trajectory(plain.initial_state(setup.q, v), steps=9)
+    plain = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=engine)
     names = ("articulation.pseudo_inertia", "terms.1.friction.mu")
     values = {n: x.clone().requires_grad_() for n, x in parameters(setup.scene).items() if n in names}
-    simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name](), engine=Torch())
+    simulator = Simulator(with_parameters(setup.scene, values), 0.05, SMOOTH[name](), engine=engine)
+    given = v.clone().requires_grad_()
+    start = simulator.initial_state(setup.q, given)
+    expected = plain.trajectory(mapped_tensors(start, Tensor.detach), steps=9)
     gradients = []
     for checkpoint in (1, 4):
-        given = v.clone().requires_grad_()
-        path = simulator.trajectory(simulator.initial_state(setup.q, given), steps=9, checkpoint=checkpoint)
+        path = simulator.trajectory(start, steps=9, checkpoint=checkpoint)
         assert torch.equal(path.q, expected.q)
         assert torch.equal(path.v, expected.v)
         assert torch.equal(path.status, expected.status)
-        gradients.append(torch.autograd.grad((path.q[-1] ** 2).sum() + path.v[3].sum(), (given, *values.values())))
+        end = (path.q[-1] ** 2).sum() + path.v[3].sum()
+        gradients.append(torch.autograd.grad(end, (given, *values.values()), retain_graph=True))
     for once, again in zip(*gradients, strict=True):
         torch.testing.assert_close(once, again, rtol=1e-12, atol=1e-12 * float(once.abs().max()))
-    record = simulator.rollout(simulator.initial_state(setup.q, v), steps=9)
+    record = simulator.rollout(start, steps=9)
     assert torch.equal(record.q, expected.q)
+
+
+@all_integrators
+def test_starts_have_the_same_values(name: str) -> None:
+    """With and without derivatives: to the bit in PyTorch, which goes on from where the core's trial ends, but for rounding."""
+    setup = SCENES["chain-slope-drop"](worlds=2)
+    for engine, off in ((Torch(), 0.0), (None, 1e-10)):
+        simulator = Simulator(setup.scene, 0.05, SMOOTH[name](), engine=engine)
+        starts = [simulator.initial_state(setup.q, v) for v in (setup.v, setup.v.clone().requires_grad_())]
+        for without, carrying in zip(*map(tensors_of, starts), strict=True):
+            torch.testing.assert_close(carrying, without, rtol=0, atol=off, equal_nan=True)
 
 
 def test_the_same_twice() -> None:

@@ -21,7 +21,7 @@ from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import Worlds
-from tests.native_parity import resting
+from tests.native_parity import at_once, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -156,7 +156,7 @@ def test_schemes_on_positions_step_as_the_reference(name: str, dt: float, scheme
         state, _, _ = native.made(state, control)
     for control in controls[30:34]:
         after, solution, _ = native.made(state, control)
-        expected, found, _ = simulator.eager.made(state, control)
+        expected, found, _ = at_once(simulator.eager).made(state, control)
         both = (solution.status == int(Status.SOLVED)) & (found.status == int(Status.SOLVED))
         alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
         direct, same = direct + int(both.sum()), same + int(alike.sum())

@@ -26,7 +26,7 @@ from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.contact import Contact
 from pbfd_torch.tree.kinematics import place, retract
-from tests.native_parity import DT, SCHEMES, apart, begun, fields, largest_gap, require_starts, trial_of
+from tests.native_parity import DT, SCHEMES, apart, at_once, begun, fields, largest_gap, require_starts, trial_of
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -99,7 +99,7 @@ def test_parity(name: str, integrator: Integrator[Any]) -> None:
     q, v, control = starts(name)
     native = NativeStepper(Simulator(of(name).scene, DT, integrator).eager)
     start = begun(native, q, v, control)
-    reference, end, status = traced(native.eager, q, v, control)
+    reference, end, status = traced(at_once(native.eager), q, v, control)
     solved = int(Status.SOLVED)
     both = (start.status == solved) & (status == solved)
     same = both & ((end - start.end).abs().amax(-1) < 1e-7)
@@ -136,7 +136,7 @@ def test_float32_trials(name: str) -> None:
     q, v, control = (x.float() for x in starts(name))
     native = NativeStepper(Simulator(of(name, torch.float32).scene, DT).eager)
     start = begun(native, q, v, control)
-    _, end, status = traced(native.eager, q, v, control)
+    _, end, status = traced(at_once(native.eager), q, v, control)
     objective = trial_of(Simulator(of(name).scene, DT).eager, q.double(), v.double(), control.double())
     ours, theirs = (objective.error(objective.evaluate(x.double()), 1e-3) for x in (start.end, end))
     both = (start.status == int(Status.SOLVED)) & (status == int(Status.SOLVED))
