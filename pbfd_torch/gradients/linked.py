@@ -204,8 +204,11 @@ class _Start(Play[S]):
             self._trials.append((way.kept(), solution.solved))
             return end, solution.solved
 
+        begun, maker = stepper.with_attempt(attempt).initial_state(*start, control), self.linked.maker(stepper, start)
+        if maker is not stepper:
+            begun = maker.initial_state(*start, control)  # the values of a start without derivatives, to the bit
         # what a node gives back must not share memory with what it was given, nor among itself, for forward derivatives
-        return mapped_tensors(stepper.with_attempt(attempt).initial_state(*start, control), torch.clone)
+        return mapped_tensors(begun, torch.clone)
 
     def again(self, stepper: EagerStepper[S], start: tuple[Tensor, Tensor], control: Tensor | None) -> S:
         trials, dtype, blur = iter(self._trials), start[0].dtype, self.linked.gradients.blur

@@ -35,6 +35,23 @@ const Holding HOLDINGS[] = {{false, false, 0, 0.5, {}},
                             {false, true, PAPER, 1e6, {2, 1, 1, 0, 0, 0, 0, 0.05, 1 / 0.5}},
                             {false, true, GRADIENT, 1e6, {1.7, 0.5, 1.4, 0, 0, 0, 0, 0.05, 1 / 0.05}}};
 
+enum Solid { HULL = 4, TERRAIN, SAMPLED };  // after the ball, the capsule, the box and the cylinder
+
+// The faces and edges of a box, as polyhedron.h reads them.
+std::vector<double> block(double x, double y, double z) {
+  const double half[3] = {x, y, z};
+  std::vector<double> out;
+  for (int k = 0; k < 6; k++)
+    for (int j = 0; j < 4; j++) out.push_back(j == 3 ? half[k / 2] : j == k / 2 ? (k % 2 ? 1 : -1) : 0);
+  for (int k = 0; k < 12; k++) {  // along the axis k / 4
+    double ends[6];
+    for (int e = 0; e < 2; e++)
+      for (int j = 0, bit = 0; j < 3; j++) ends[3 * e + j] = half[j] * (j == k / 4 ? 2 * e - 1 : (k >> bit++) % 2 ? 1 : -1);
+    out.insert(out.end(), ends, ends + 6);
+  }
+  return out;
+}
+
 // A free body at z = 1.2 or so that touches a solid whose top is at z = 1, by a candidate of one kind.
 struct Scene {
   std::vector<int> whole;
@@ -43,14 +60,19 @@ struct Scene {
 
   Scene(int kind, const Holding& how) {
     const bool anchored = how.anchored;
-    const bool plane = kind < 3, rim = kind == 2 || kind >= 9;  // see kinds.h
-    const int solid = plane ? -1 : kind < 9 ? kind - 3 : kind - 5, samples = solid == 4 ? CELLS * CELLS : solid == 5 ? CELLS * CELLS * CELLS : 0;
+    const bool plane = kind < 3, rim = kind == 2 || kind >= 10;  // see kinds.h
+    const int solid = plane ? -1 : kind < 10 ? kind - 3 : kind - 5;
+    if (solid == HULL) heights = block(0.5, 0.6, 1);
+    const int samples = solid == TERRAIN ? CELLS * CELLS : solid == SAMPLED ? CELLS * CELLS * CELLS : int(heights.size());
     whole = {-1, FREE, 0, 0, 1, 0, 1, 2, 3, 4, 5};  // how many dofs each dof rides on, and which
     for (int i = 0; i < NV; i++)
       for (int j = 0; j < NV; j++) whole.push_back(j < i ? j : 0);
     for (int k = 0; k < KINDS; k++) whole.push_back(k == kind);
     whole.insert(whole.end(), {0, 0, 0, anchored ? 0 : -1, how.uncommon - 1});  // carrier, solid, form, anchor, law
-    if (!plane) whole.insert(whole.end(), {0, CELLS, CELLS, solid == 5 ? CELLS : 1});
+    if (solid == HULL)
+      whole.insert(whole.end(), {0, 6, 12, 0});
+    else if (!plane)
+      whole.insert(whole.end(), {0, CELLS, CELLS, solid == SAMPLED ? CELLS : 1});
     if (how.uncommon) whole.push_back(how.manner);
     real = {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 1, MASS, 0.01, 0, 0.02, SECOND, 0, 0, 0, SECOND, 0, 0, 0, 2 * SECOND, MASS};
     auto each = [&](double straight, double turning) {
@@ -64,16 +86,16 @@ struct Scene {
     real.insert(real.end(), {0.05, 0.02, 0, rim || kind == 0 ? 0 : 0.2, kind == 0 ? 0.2 : 0, 1e4, how.mu, 0.01, 1 / 0.3, anchored ? 1 / 1e-3 : 1 / 1e-2});
     if (plane) real.insert(real.end(), {0, 0, 1, 1});
     if (!plane) {
-      real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == 4 ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
-      const double sizes[6][6] = {{1}, {0.6, 0.4}, {0.5, 0.6, 1}, {0.7, 1}, {-0.4, -0.4, 0.1, 0.1}, {-0.4, -0.4, 0.6, 0.1}};
+      real.insert(real.end(), {1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, solid == TERRAIN ? 1.0 : 0.0});  // a frame; terrain lies at z = 1
+      const double sizes[7][6] = {{1}, {0.6, 0.4}, {0.5, 0.6, 1}, {0.7, 1}, {1}, {-0.4, -0.4, 0.1, 0.1}, {-0.4, -0.4, 0.6, 0.1}};
       real.insert(real.end(), sizes[solid], sizes[solid] + 6);
-      real.push_back(solid < 4 ? 1 : INF);
-      for (int i = 0; i < samples; i++)  // hills, or heights above z = 1, with waves
-        heights.push_back(solid == 4 ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
+      real.push_back(solid <= HULL ? 1 : INF);
+      for (int i = 0; i < samples && solid > HULL; i++)  // hills, or heights above z = 1, with waves
+        heights.push_back(solid == TERRAIN ? 0.02 * std::sin(0.9 * i) : 0.1 * (i % CELLS) - 0.5 + 0.01 * std::cos(1.7 * i));
     }
     if (rim) real.insert(real.end(), {0.04, 0, 0, 0, 0.05, 0, 0, 0, 0.03, 0, 1, 0, 0});
     if (how.uncommon) real.insert(real.end(), how.particulars, how.particulars + PARTICULARS);
-    sizes = {{1, anchored, plane, !plane, samples, rim, how.uncommon}, 1, NQ, NV, 0, 0, 0};
+    sizes = {{1, anchored, plane, !plane, samples, rim, how.uncommon}, 1, NQ, NV, 0, 0};
     CHECK(Plan<double>::whole_numbers(sizes) == int(whole.size()));
     CHECK(Plan<double>::real_numbers(sizes) == int(real.size()));
   }
