@@ -16,6 +16,11 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(-1)
 
 
+def cross(a: Tensor, b: Tensor) -> Tensor:
+    """a × b, `[*, 3], [*, 3] → [*, 3]`; one of them may have fewer dimensions."""
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b))
+
+
 def outer(a: Tensor, b: Tensor) -> Tensor:
     """a bᵀ, `[*, n], [*, m] → [*, n, m]`."""
     return a[..., :, None] * b[..., None, :]

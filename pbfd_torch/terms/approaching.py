@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pbfd_torch.contact.approach import Approach
 from pbfd_torch.contact.closest import Meeting
-from pbfd_torch.tensors.vectors import outer, rows
+from pbfd_torch.tensors.vectors import cross, outer, rows
 from pbfd_torch.terms.supported import Supported
 from pbfd_torch.terms.touching import shifting
 from pbfd_torch.tree.rotations import skew
@@ -71,7 +71,7 @@ class Approaching(Supported):
         by_turn, reach = self._spread_slope, self._reach[..., None]
         longer = 0.5 * rows(self.normal, by_turn) / reach
         nearest = (outer(self._spread, longer) / reach[..., None] - by_turn) / reach[..., None]
-        leans = torch.nn.functional.pad(torch.linalg.cross(self._line, self.normal)[..., None, :], (0, 3, 0, 1))
+        leans = torch.nn.functional.pad(cross(self._line, self.normal)[..., None, :], (0, 3, 0, 1))
         tilt, slides = self.approach.answer(self.shift + nearest + self._swings, leans)
         follows = self.follows[..., None]
         return torch.where(follows[..., None], tilt, 0.0), torch.where(follows, slides[..., 0, :], 0.0)

@@ -24,7 +24,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.facts import fact
 from pbfd_torch.tensors.shapes import broadcast_shapes
-from pbfd_torch.tensors.vectors import applied, extended, mapped, outer, rotated
+from pbfd_torch.tensors.vectors import applied, cross, extended, mapped, outer, rotated
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.contact_laws import ContactLaws, Prepared
 from pbfd_torch.terms.contact_outlook import contact_outlook
@@ -270,8 +270,8 @@ class Contact(ContactLaws[PreparedContact]):
         if self.rounded:  # as in the slip: the surface moves by φ × s beside its centre
             out = contact.at.centers - contact.at.points
             spin = motion.twists[..., self.link, :3]
-            velocity = velocity - torch.linalg.cross(spin, out)
-            acceleration = acceleration - torch.linalg.cross(motion.drifts[..., self.link, :3], out)
+            velocity = velocity - cross(spin, out)
+            acceleration = acceleration - cross(motion.drifts[..., self.link, :3], out)
             if (bulge := contact.at.bulge(spin)) is not None:
                 acceleration = acceleration - bulge[..., None] * contact.at.normal
         return contact_outlook(contact, velocity, acceleration)

@@ -16,7 +16,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import dot, rotated, rows
+from pbfd_torch.tensors.vectors import cross, dot, rotated, rows
 from pbfd_torch.terms.touching import Touching
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
 
@@ -67,7 +67,7 @@ class Supported(Touching):
     @cached_property
     def travel(self) -> Tensor:
         """m `[*, n, 3]`."""
-        return self.moved + torch.linalg.cross(self._rolled, self.arm)
+        return self.moved + cross(self._rolled, self.arm)
 
     @cached_property
     def _spread_slope(self) -> Tensor:
@@ -106,9 +106,9 @@ class Supported(Touching):
 
     def bulge(self, spin: Tensor) -> Tensor:
         """See `Touching`: h'' less what ω̇ makes of it, with η' = −ω × n: (η'ᵀM η' − (s · η')²)/h − n · (ω × (ω × s))."""
-        turning = -torch.linalg.cross(spin, self.normal)
+        turning = -cross(spin, self.normal)
         spread = dot(rotated(self.form, turning), turning) - dot(self.arm, turning).square()
-        return spread / self._reach - dot(torch.linalg.cross(spin, torch.linalg.cross(spin, self.arm)), self.normal)
+        return spread / self._reach - dot(cross(spin, cross(spin, self.arm)), self.normal)
 
     def wandering(self, force: Tensor) -> Tensor:
         """See `Touching`: p moves by δs where a material point there would by ω × s."""

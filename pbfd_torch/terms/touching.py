@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pbfd_torch.tensors.vectors import dot, outer, rows, trace_minus
+from pbfd_torch.tensors.vectors import cross, dot, outer, rows, trace_minus
 from pbfd_torch.terms.friction_law import FrictionLaw, Lifting, Storing, slip_size
 from pbfd_torch.terms.release import NormalLaw
 from pbfd_torch.tree.rotations import log_jacobian_left, skew
@@ -67,7 +67,7 @@ class Touching:
         """m `[*, n, 3]`."""
         if self.radius is None or self.turn is None:
             return self.moved
-        return self.moved - self.radius[..., None] * torch.linalg.cross(self.turn, self.normal)
+        return self.moved - self.radius[..., None] * cross(self.turn, self.normal)
 
     @cached_property
     def slip(self) -> Tensor:
