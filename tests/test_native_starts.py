@@ -142,7 +142,7 @@ def test_float32_trials(name: str) -> None:
     both = (start.status == int(Status.SOLVED)) & (status == int(Status.SOLVED))
     assert float(both.double().mean()) > 0.5
     assert float(ours[both].mean()) <= 1.25 * float(theirs[both].mean())
-    assert float(ours[both].max()) <= 1.5 * float(theirs[both].max())
+    assert float(ours[both].square().mean()) <= 1.5**2 * float(theirs[both].square().mean())
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
@@ -199,7 +199,7 @@ def test_unsolved_trials() -> None:
 
 @pytest.mark.parametrize("integrator", SCHEMES)
 def test_starts_that_carry_derivatives(integrator: Integrator[Any]) -> None:
-    """They are made in PyTorch, and the others by the core."""
+    """Their values are those of the others, to the bit."""
     setup = of("hopper", worlds=3)
     q, v = setup.q.clone(), setup.v + 0.1
     simulator = Simulator(setup.scene, DT, integrator, engine=Native())
@@ -209,7 +209,7 @@ def test_starts_that_carry_derivatives(integrator: Integrator[Any]) -> None:
     carrying = simulator.initial_state(q.clone().requires_grad_(), v)
     moved = carrying.v if isinstance(integrator, EnergyMomentum) else carrying.q_previous
     assert moved.requires_grad
-    for field, ours, theirs in fields(carrying, simulator.eager.initial_state(q, v, None)):
+    for field, ours, theirs in fields(carrying, expected):
         assert torch.equal(ours.detach(), theirs), field
     with forward_ad.dual_level():
         dual = simulator.initial_state(q, forward_ad.make_dual(v, torch.ones_like(v)))
