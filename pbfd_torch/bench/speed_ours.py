@@ -12,14 +12,14 @@ from pbfd_torch.bench.precision import step_count
 from pbfd_torch.bench.precision_scenes import Case
 from pbfd_torch.bench.precision_tracks import Track
 from pbfd_torch.bench.speed_scenes import Course, Work
+from pbfd_torch.bench.stepped import solved, stepped
 from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.native.engine import Native, Torch
-from pbfd_torch.native.stepper import NativeStepper, uncovered
+from pbfd_torch.native.stepper import uncovered
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import Simulator
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
-from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.tensors.structures import in_dtype
 
 ENGINES = ("native", "torch")
@@ -67,14 +67,14 @@ class Ours:
         """What makes these rollouts, one after another."""
         simulator = self._simulator(len(works[0].q), threads)
         begun = [self._begun(simulator, work) for work in works]
-        return lambda: [_run(simulator.stepper, state, controls)[1] for state, controls in begun]
+        return lambda: [solved(simulator, state, len(controls), controls) for state, controls in begun]
 
     def ready_under_way(self, record: Record, worlds: int, groups: int, steps: int, threads: int) -> Call:
         """What stands for rollouts that would take too long: a few steps of so many groups of worlds, one after another, each world
         from a state of the record at another time, spread evenly over it."""
         simulator, kind = self._simulator(worlds, threads), DTYPES[self.dtype]
         begun = [in_dtype(record.spread(worlds, group, groups, steps), kind) for group in range(groups)]
-        return lambda: [_run(simulator.stepper, state, controls)[1] for state, controls in begun]
+        return lambda: [solved(simulator, state, len(controls), controls) for state, controls in begun]
 
     def motion(self, case: Case, duration: float) -> Track:
         """The case's, from the scene's own start."""
@@ -95,7 +95,7 @@ class Ours:
         """All states of a work."""
         simulator = self._simulator(len(work.q), 1)
         state, controls = self._begun(simulator, work)
-        return Record(_run(simulator.stepper, state, controls)[0], controls)
+        return Record(stepped(simulator, state, len(controls), controls)[0], controls)
 
     def _begun(self, simulator: Simulator[Velocities], work: Work) -> tuple[Velocities, Tensor]:
         q, v, controls = (x.to(DTYPES[self.dtype]) for x in (work.q, work.v, work.controls))
@@ -113,19 +113,3 @@ def definition(course: Course) -> Ours:
     """What makes long motions of a scene in double precision: the core where it can, which is judged by PyTorch; else PyTorch."""
     native = Ours(course, "native", "float64")
     return Ours(course, "torch", "float64") if native.missing() else native
-
-
-def _run(stepper: Stepper[Velocities], state: Velocities, controls: Tensor) -> tuple[Velocities, Solution]:
-    """The states after all steps, and how they were solved, `[steps, worlds, ...]`: the core makes them in one call."""
-    if isinstance(stepper, NativeStepper):
-        return stepper.run(state, controls, len(controls))
-    states, solutions = [], []
-    for control in controls:
-        state, solution, _ = stepper.made(state, control)
-        states.append(state)
-        solutions.append(solution)
-    return mapped(_stacked, *states), mapped(_stacked, *solutions)
-
-
-def _stacked(*each: Tensor) -> Tensor:
-    return torch.stack(each)
