@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from pbfd_torch import Bdf2, EnergyMomentum, ImplicitEuler, Simulator, Variational
 from pbfd_torch.integrators.integrator import Integrator
@@ -51,16 +50,12 @@ def test_frames_are_the_references(name: str, scheme: Integrator[Any]) -> None:
 def test_frames_on_moving_obstacles() -> None:
     """Where obstacles are is asked for at the times of each world's own steps, which the core makes one by one."""
     setup = SCENES["turntable"](worlds=2)
+    state = Simulator(setup.scene, FRAME).initial_state(setup.q, setup.v)
     found, expected = (
-        AdaptiveSimulator(setup.scene, FRAME, ACCURACY, engine=engine).rollout(setup_state(setup.scene, setup.q, setup.v), steps=2)
-        for engine in (Native(), Torch())
+        AdaptiveSimulator(setup.scene, FRAME, ACCURACY, engine=engine).rollout(state, steps=2) for engine in (Native(), Torch())
     )
     assert torch.equal(found.substeps, expected.substeps)
     assert float((found.q - expected.q).abs().max()) < 1e-9
-
-
-def setup_state(scene: Any, q: Tensor, v: Tensor) -> Any:
-    return Simulator(scene, FRAME).initial_state(q, v)
 
 
 @pytest.mark.parametrize("scheme", INTEGRATORS, ids=lambda x: type(x).__name__)

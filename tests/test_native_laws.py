@@ -30,7 +30,7 @@ from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.static_friction import StaticFriction
 from pbfd_torch.tree.kinematics import place, retract
-from tests.native_parity import DT, at_once, require_balance, require_starts, require_steps, resting
+from tests.native_parity import DT, at_once, require_balance, require_single_precision, require_starts, require_steps, resting
 from tests.native_piles import SHAPES, pile, thrown_together
 from tests.test_native_contact import BALLS, GROUND, SOLIDS, WALL, beside, touching
 from tests.test_native_records import recorded, require_same
@@ -255,16 +255,11 @@ def test_no_world_knows_another(law: str, between: bool) -> None:
 def test_single_precision() -> None:
     """Steps with all laws go on as those in double precision do."""
     for law in LAWS.values():
-        ends = []
-        for dtype in (torch.float64, torch.float32):
-            scene = with_laws(touching(*GEOMETRIES["half-spaces"], dtype=dtype), under(law))
-            state, _ = beside(scene, 12, 5)
-            native = NativeStepper(Simulator(scene, DT).eager)
-            states, solution = native.run(native.initial_state(state.q, state.v, None), None, 3)
-            ends.append((states.q.double(), solution.status))
-        solved = (ends[0][1] == 0).all(0) & (ends[1][1] == 0).all(0)
-        assert int(solved.sum()) >= 4
-        assert float((ends[0][0] - ends[1][0])[:, solved].abs().max()) < 1e-3
+
+        def scene(dtype: torch.dtype, law: Any = law) -> Scene:
+            return with_laws(touching(*GEOMETRIES["half-spaces"], dtype=dtype), under(law))
+
+        require_single_precision(scene, lambda made: beside(made, 12, 5)[0])
 
 
 @pytest.mark.parametrize("choice", Friction)

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.contact.half_space import HalfSpace
@@ -33,7 +32,7 @@ from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.tree.kinematics import place, retract
 from tests.bodies import diagonal
 from tests.native_moving import MOTIONS, SCHEMES, crowd, drawn, laid, riding, thrown, timed
-from tests.native_parity import DT, fields, require_balance, resting
+from tests.native_parity import DT, fields, require_balance, require_same_steps, resting
 from tests.native_parity import begun as begun_from
 from tests.native_piles import SHAPES
 from tests.test_native_anchors import anchored, require_kept, stretched
@@ -143,22 +142,7 @@ def begun(scene: Scene, worlds: int, scheme: Any, dt: float = DT, before: int = 
 def test_steps(scheme: Any, motion: str, shapes: str) -> None:
     """To the same root as the reference's, and on from it alike, where both solve the step directly."""
     native, state = begun(riding(MOTIONS[motion], SHAPES[shapes]), 12, scheme)
-    direct = same = 0
-    for _ in range(3):
-        after, solution, _ = native.made(state, None)
-        expected, found, _ = native.eager.made(state, None)
-        both = (solution.status == found.status) & (found.status <= int(Status.EASED))
-        alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert torch.equal(after.time, expected.time)
-        assert torch.equal(after.hazards[alike], expected.hazards[alike])
-        for name, ours in vars(after).items():
-            theirs = getattr(expected, name)
-            if isinstance(ours, Tensor) and ours.dtype == torch.float64:
-                assert torch.allclose(ours[alike], theirs[alike], rtol=1e-5, atol=1e-3, equal_nan=True), name
-        state = after
-    assert direct >= 18
-    assert same >= 0.97 * direct
+    require_same_steps(native, state, 3, 18)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

@@ -22,7 +22,6 @@ from pbfd_torch.native.engine import Native
 from pbfd_torch.native.library import library
 from pbfd_torch.native.plan import planned
 from pbfd_torch.native.stepper import NativeStepper, uncovered
-from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
 from pbfd_torch.terms.contact import Contact
@@ -39,7 +38,7 @@ from pbfd_torch.terms.torsional_friction import TorsionalFriction
 from pbfd_torch.tree.kinematics import retract
 from tests.bodies import diagonal
 from tests.native_moving import MOTIONS, SCHEMES, drawn, timed
-from tests.native_parity import DT, gaps, require_starts, require_steps, resting
+from tests.native_parity import DT, gaps, require_same_steps, require_single_precision, require_starts, require_steps, resting
 from tests.test_native_contact import GROUND, SOLIDS, WALL, Solid, beside, require_touching, touching
 from tests.test_native_laws import lifted, require_fallbacks_alike, require_records
 from tests.test_native_moving import placed
@@ -143,21 +142,7 @@ def test_steps(solids: str, scheme: Any) -> None:
     start, _ = beside(scene, 16, 5)
     native = NativeStepper(Simulator(scene, DT, scheme).eager)
     state = timed(native.initial_state(start.q, start.v, None), drawn(16, seed=6) + 1)
-    direct = same = 0
-    for _ in range(4):
-        after, solution, _ = native.made(state, None)
-        expected, found, _ = native.eager.made(state, None)
-        both = (solution.status == found.status) & (found.status <= int(Status.EASED))
-        alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert torch.equal(after.hazards[alike], expected.hazards[alike])
-        for name, ours in vars(after).items():
-            theirs = getattr(expected, name)
-            if isinstance(ours, Tensor) and ours.dtype == torch.float64:
-                assert torch.allclose(ours[alike], theirs[alike], rtol=1e-5, atol=1e-3, equal_nan=True), name
-        state = after
-    assert direct >= 40
-    assert same >= 0.97 * direct
+    require_same_steps(native, state, 4, 40)
 
 
 @pytest.mark.parametrize("solids", ["half-spaces", "box", "grid"])
@@ -237,16 +222,9 @@ def test_no_world_knows_another() -> None:
 
 def test_single_precision() -> None:
     """Steps go on as those in double precision do."""
-    ends = []
-    for dtype in (torch.float64, torch.float32):
-        scene = braked(touching(ROUND, (GROUND, WALL), dtype=dtype))
-        state, _ = beside(scene, 12, 5)
-        native = NativeStepper(Simulator(scene, DT).eager)
-        states, solution = native.run(native.initial_state(state.q, state.v, None), None, 3)
-        ends.append((states.q.double(), solution.status))
-    solved = (ends[0][1] == 0).all(0) & (ends[1][1] == 0).all(0)
-    assert int(solved.sum()) >= 4
-    assert float((ends[0][0] - ends[1][0])[:, solved].abs().max()) < 1e-3
+    require_single_precision(
+        lambda dtype: braked(touching(ROUND, (GROUND, WALL), dtype=dtype)), lambda scene: beside(scene, 12, 5)[0]
+    )
 
 
 @pytest.mark.parametrize("choice", Friction)
