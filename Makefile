@@ -1,7 +1,7 @@
 # `make demo`, `make test`, `make lint` and `make notebooks` each work from nothing: the first one to run creates .venv.
 # Another interpreter: make test PYTHON=python3.12. Other pytest arguments: make test PYTEST_ARGS="-x tests/solvers".
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2
+PYTEST_ARGS ?= -n 2 --dist worksteal
 BIN := .venv/bin
 NATIVE := $(wildcard pbfd_torch/native/src/*)
 

@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import platform
+import runpy
 import shlex
 import shutil
 import subprocess
@@ -41,6 +42,9 @@ FLAGS = [
     *("--param=inline-unit-growth=300", "-Wno-unused-command-line-argument"),
     "-Wno-bitwise-instead-of-logical",  # of Clang's: the mask of one world is a bool
 ]
+
+# Which variants, by name; else all of them in a wheel, and the one that this processor loads in an editable installation.
+TARGETS = os.environ.get("PBFD_NATIVE_TARGETS", "")
 
 # For continuous integration: warnings are errors, and errors stop the installation.
 STRICT = os.environ.get("PBFD_NATIVE_STRICT", "") not in ("", "0")
@@ -74,6 +78,11 @@ def compiled(file: Path, flags: list[str]) -> str:
     return "" if ran.returncode == 0 else f"{command[0]} failed: {ran.stderr.strip() or f'exit status {ran.returncode}'}"
 
 
+def runnable() -> list[str]:
+    """The variants that this processor runs, the best one first, as the installed package finds them."""
+    return list(runpy.run_path("pbfd_torch/native/processor.py")["runnable"]())
+
+
 def digest(command: list[str]) -> str:
     """Of a command, its compiler and all sources."""
     found = hashlib.sha256(shlex.join(command).encode())
@@ -104,8 +113,12 @@ class BuildNative(build_ext):
             return f"pbfd_torch has no native core for the processor {machine}"
         if not compiler():
             return "no C++ compiler was found when pbfd_torch was installed"
+        variants = VARIANTS[machine]
+        targets = TARGETS.split(",") if TARGETS else runnable()[:1] if self.inplace else list(variants)
+        if unknown := [target for target in targets if target not in variants]:
+            return f"PBFD_NATIVE_TARGETS names {', '.join(unknown)}: some of {', '.join(variants)} must be named"
         with ThreadPoolExecutor() as threads:
-            failures = list(threads.map(lambda variant: self.variant(folder, *variant), VARIANTS[machine].items()))
+            failures = list(threads.map(lambda target: self.variant(folder, target, variants[target]), targets))
         failed = [failure for failure in failures if failure]
         if failed and (STRICT or len(failed) == len(failures)):
             lines = failed[0].splitlines()

@@ -25,7 +25,6 @@ from matplotlib.ticker import LogLocator, NullLocator
 from pbfd_torch.cli.options import Friction, with_friction
 from pbfd_torch.models import SCENES, Setup
 from pbfd_torch.simulator import Simulator, Solver
-from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.named import TABLE_1
 from pbfd_torch.terms.anchored_friction import AnchoredFriction
@@ -91,12 +90,7 @@ def anchored(setup: Setup, dt: float) -> Setup:
 
 def choices(touching: bool) -> list[Choice]:
     """The tolerances, the default among them, then other solvers, then other laws where something touches."""
-    found = [
-        Choice(
-            "tolerance", f"{x:g}", Fallbacks(Descent(tolerance=x, max_evaluations=200), Descent(tolerance=x, max_evaluations=100))
-        )
-        for x in TOLERANCES
-    ]
+    found = [Choice("tolerance", f"{x:g}", Fallbacks.within(x)) for x in TOLERANCES]
     found += [Choice("solver", name, TABLE_1[name]()) for name in SOLVERS]
     if touching:
         found.append(Choice("friction", "anchored", friction=anchored))

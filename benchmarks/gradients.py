@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pbfd_torch import Descent, Fallbacks, Simulator
+from pbfd_torch import Fallbacks, Simulator
 from pbfd_torch.bench.starts import scattered
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.integrators.named import INTEGRATORS
@@ -33,9 +33,7 @@ DT = 0.02
 PHASES = {"whole": (0, 100), "landing": (12, 20), "lying": (90, 20)}  # steps before it, steps of it
 
 
-def precise() -> Fallbacks:
-    """A solver to rounding, for differences."""
-    return Fallbacks(Descent(tolerance=1e-13, max_evaluations=300), Descent(tolerance=1e-13, max_evaluations=100))
+PRECISE = Fallbacks.within(1e-13)  # to rounding, for differences
 
 
 def moved(state: Any, direction: Tensor, h: float) -> Any:
@@ -74,7 +72,7 @@ def measured(name: str, phase: str, worlds: int, rounds: int) -> dict[str, float
         held.append(spent)
         back.append(_timed(lambda: torch.autograd.grad(end.sum(), h)[0])[1])  # noqa: B023
     first = state.take(Worlds((worlds,), torch.zeros(1, dtype=torch.long)))
-    strict = Simulator(SCENES["chain-ground"]().scene, DT, INTEGRATORS[name](), precise())
+    strict = Simulator(SCENES["chain-ground"]().scene, DT, INTEGRATORS[name](), PRECISE)
     probes = [float(path_end(strict, moved(first, direction[:1], s * 1e-6), steps)) for s in (1, -1)]
     h = torch.zeros((), dtype=torch.float64, requires_grad=True)
     exact = float(torch.autograd.grad(path_end(strict, moved(first, direction[:1], h), steps)[0], h)[0])

@@ -142,6 +142,12 @@ class Fallbacks:
     detours: tuple[Detour, ...] = (WarmStart(), WIDTHS, STIFFNESSES)
     stage: Descent = field(default_factory=lambda: Descent(max_evaluations=60))
 
+    @classmethod
+    def within(cls, tolerance: float | None) -> Fallbacks:
+        """The default one to another tolerance, see `Descent`."""
+        direct, last, stage = (Descent(tolerance=tolerance, max_evaluations=most) for most in (200, 100, 60))
+        return cls(direct, last, stage=stage)
+
     @property
     def brisk(self) -> Descent:
         """For a step that has an easier one to fall back on: the direct way, given up soon. What it does not solve by then seldom

@@ -21,7 +21,6 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.scene import Scene
-from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.tree.kinematics import difference, retract
@@ -34,7 +33,7 @@ AXES = ("joint_axis", "normal", "normals")
 FLOOR = 1e-3  # the end is of the size of 1, and so are its largest derivatives
 FORMS = (".form", ".axis")  # of curved candidates: those among them that are points have none to be differentiated by
 SHARED = (".normals", ".offsets", ".starts", ".ends", ".coefficients", ".origin", ".spacing")
-PRECISE = 1e-13  # of the weight: differences see the solver's tolerance
+PRECISE = Fallbacks.within(1e-13)  # of the weight: differences see the solver's tolerance
 
 # what depends on the energy gained so far would jump within the differences
 SMOOTH: dict[str, Callable[[], Integrator[Any]]] = {**INTEGRATORS, "energy-momentum": partial(EnergyMomentum, math.inf)}
@@ -44,11 +43,6 @@ def kind(name: str) -> str:
     """What a parameter is, by its name."""
     parts = name.split(".")
     return "carrier.start" if parts[-2:] == ["carrier", "start"] else parts[-1]
-
-
-def precise_solver() -> Fallbacks:
-    """Solves to rounding."""
-    return Fallbacks(Descent(tolerance=PRECISE, max_evaluations=300), Descent(tolerance=PRECISE, max_evaluations=100))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +86,7 @@ class Experiment:
         scene = with_parameters(self.scene, {name: x for name, x in values.items() if name not in own})
         q, v, dt, control = (values.get(name, getattr(self, name)) for name in own)
         many = isinstance(dt, Tensor) and dt.ndim > 0
-        simulator = Simulator(scene, self.dt if many else dt, self.integrator(), precise_solver())
+        simulator = Simulator(scene, self.dt if many else dt, self.integrator(), PRECISE)
         if many:
             simulator = simulator.sized(dt)
         state = simulator.initial_state(q, v, control)

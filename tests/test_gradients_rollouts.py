@@ -28,7 +28,7 @@ from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 from pbfd_torch.tree.kinematics import difference
 from tests.bodies import GRAVITY, diagonal
 from tests.finite_differences import derivative
-from tests.gradient_checks import SMOOTH, precise_solver
+from tests.gradient_checks import PRECISE, SMOOTH
 from tests.random_trees import generator
 from tests.sliding_box import stopped
 from tests.touching_bodies import free_bodies, posed
@@ -262,7 +262,7 @@ def test_special_points(point: str) -> None:
     nv = scene.articulation.nv
 
     def end(v: Tensor) -> Tensor:
-        simulator = Simulator(scene, 0.01, solver=precise_solver())
+        simulator = Simulator(scene, 0.01, solver=PRECISE)
         path = simulator.trajectory(simulator.initial_state(q, v), steps=2)
         return difference(scene.articulation, q, path.q[-1]).sum()
 

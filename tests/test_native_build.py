@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from pbfd_torch.native.processor import LEVELS, runnable
+
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ROOT / "pbfd_torch" / "native" / "src"
 
@@ -77,3 +79,26 @@ def test_strict_installations_fail(checkout: Path) -> None:
     ran = subprocess.run(command, cwd=checkout, env=environment, check=False, capture_output=True, text=True)
     assert ran.returncode != 0
     assert "error: the native core could not be compiled" in ran.stderr
+
+
+def test_which_variants_are_made(checkout: Path) -> None:
+    """The one for this processor where sources are worked on, all of them in a wheel, or those that are asked for."""
+
+    def tried(*command: str, targets: str = "") -> list[str]:
+        environment = os.environ | {"CXX": "/bin/false", "PBFD_NATIVE_STRICT": "0", "PBFD_NATIVE_TARGETS": targets}
+        code = [sys.executable, "setup.py", "-v", "build_ext", *command]
+        ran = subprocess.run(code, cwd=checkout, env=environment, check=True, capture_output=True, text=True)
+        said = (ran.stdout + ran.stderr).splitlines()
+        return [line.split("native core for ")[1].split(":")[0] for line in said if "native core for " in line]
+
+    assert tried("--inplace") == [runnable()[0]]
+    assert sorted(tried()) == sorted(runnable() if runnable() == ("arm64",) else LEVELS)
+    assert tried(targets=runnable()[-1]) == [runnable()[-1]]
+
+
+def test_variants_that_do_not_exist(checkout: Path) -> None:
+    environment = os.environ | {"PBFD_NATIVE_STRICT": "1", "PBFD_NATIVE_TARGETS": "x86-64-v5"}
+    command = [sys.executable, "setup.py", "build_ext"]
+    ran = subprocess.run(command, cwd=checkout, env=environment, check=False, capture_output=True, text=True)
+    assert ran.returncode != 0
+    assert "PBFD_NATIVE_TARGETS names x86-64-v5: some of " in ran.stderr

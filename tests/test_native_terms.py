@@ -1,15 +1,17 @@
-"""What acts besides contacts in the compiled core: limits that drives press on, pushes."""
+"""What acts besides contacts in the compiled core: limits that drives press on, pushes, springs and damping of free bodies."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from pbfd_torch import Articulation, Joint, JointKind, Link, Scene
+from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.native.library import library
+from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_limits import JointLimits
+from pbfd_torch.terms.joint_springs import JointDamping, JointSprings
 from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.kinematics import retract
 from tests.bodies import diagonal
@@ -64,3 +66,30 @@ def test_pushes() -> None:
     require_balance(scene, resting(retract(a, q, -DT * v), v), q)
     require_steps(scene, resting(q, v))
     require_starts(scene, q, v)
+
+
+def test_springs_and_damping_of_a_free_body() -> None:
+    """Where coordinates add up each has its own share of the step, so also where a free joint moves straight."""
+    a = arm()
+    random = torch.Generator().manual_seed(4)
+    stiffness, damping = 0.5 + torch.rand(2, a.nv, dtype=torch.float64, generator=random)
+    stiffness[3:6], damping[3:6] = 2.0, 0.4  # the same about all axes
+    v, moved = 0.3 * torch.randn(2, 20, a.nv, dtype=torch.float64, generator=random)
+    rest, q = a.rest, retract(a, a.rest.expand(20, -1), moved)
+    terms = (Inertia(), JointSprings(200.0 * stiffness, retract(a, rest, 0.1 * moved[0])), JointDamping(5.0 * damping))
+    scene = Scene(a, terms, torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64))
+    require_balance(scene, resting(retract(a, q, -DT * v), v), q)
+    require_steps(scene, resting(q, v))
+    require_starts(scene, q, v)
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-12])
+def test_other_tolerances(tolerance: float) -> None:
+    """The core solves as well as it is asked to, and no better."""
+    scene = Scene(arm(), (Inertia(),), torch.zeros(3, dtype=torch.float64))
+    v = 3 * torch.randn(50, scene.articulation.nv, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    simulator = Simulator(scene, 0.05, solver=Fallbacks.within(tolerance))
+    assert simulator.engine == "native"
+    rollout = simulator.rollout(simulator.initial_state(scene.articulation.rest, v), steps=5)
+    assert bool(rollout.solved.all())
+    assert 1e-3 * tolerance < float(rollout.residual_norm.max()) <= tolerance

@@ -60,7 +60,8 @@ class NativeStepper(Generic[S]):
         self.threads = threads or torch.get_num_threads()
         scheme: object = eager.integrator
         surplus = scheme.surplus if isinstance(scheme, EnergyMomentum) else math.inf
-        tolerance = Fallbacks().direct.tolerance_for(eager.articulation.dtype)
+        assert isinstance(eager.solver, Fallbacks)
+        tolerance = eager.solver.direct.tolerance_for(eager.articulation.dtype)
         share = scheme.share if isinstance(scheme, Variational) else 1.0
         jump = scheme.jump if isinstance(scheme, Bdf2) else math.inf
         halvings = eager.halvings
@@ -202,8 +203,9 @@ def plan_of(eager: EagerStepper[Any]) -> Plan:
     """The plan of steps that the core can make. Raises `NotCompiledError` for others, and where there is no core."""
     if library() is None:
         raise NotCompiledError(reason())
-    if eager.solver != Fallbacks():
-        raise NotCompiledError("the core does not know a solver other than the default one")
+    solver = eager.solver
+    if not isinstance(solver, Fallbacks) or solver != Fallbacks.within(solver.direct.tolerance):
+        raise NotCompiledError("the core does not know a solver other than the default one, to any tolerance")
     if type(eager.integrator) not in SCHEMES:
         raise unknown(f"integrator {type(eager.integrator).__name__}")
     return planned(eager)

@@ -30,28 +30,29 @@ class Ways:
 
     def way(self, integrator: Integrator[Any], q: Tensor) -> Way:
         """That of steps which end at q `[*batch, nq]`."""
-        batch, halved = tuple(q.shape[:-1]), self.halved.reshape(-1)
-        eased, ends = (x.reshape(-1, *x.shape[len(batch) :]) for x in (self.eased, self.ends))
-        if not bool((halved | eased[:, 0]).any()):  # as most steps are
+        if not bool((self.halved | self.eased[..., 0]).any()):  # as most steps are
             return Way(q)
-        detours = list(_eased(batch, torch.where(halved == 0, eased[:, 0], 0), integrator, ends[:, 0]))
-        for times in halved[halved > 0].unique().tolist():
-            index = (halved == times).nonzero().squeeze(-1)
-            legs = tuple(self._leg(eased[index, part], integrator, ends[index, part]) for part in range(2**times))
-            detours.append(_taken(batch, index, integrator, legs))
+        detours = list(_eased(torch.where(self.halved == 0, self.eased[..., 0], 0), integrator, self.ends[..., 0, :]))
+        for times in self.halved[self.halved > 0].unique().tolist():
+            worlds = Worlds(tuple(self.halved.shape), _where(self.halved == times))
+            eased, ends = worlds.rows(self.eased), worlds.rows(self.ends)
+            parts = range(2**times)
+            legs = tuple(Way(ends[..., k, :], tuple(_eased(eased[..., k], integrator, ends[..., k, :]))) for k in parts)
+            detours.append(_taken(worlds, integrator, legs))
         return Way(q, tuple(detours))
 
-    @staticmethod
-    def _leg(eased: Tensor, integrator: Integrator[Any], ends: Tensor) -> Way:
-        return Way(ends, tuple(_eased((len(ends),), eased, integrator, ends)))
 
-
-def _eased(batch: tuple[int, ...], which: Tensor, integrator: Integrator[Any], ends: Tensor) -> Iterator[Detour]:
-    """Those of worlds that have made easier steps."""
+def _eased(which: Tensor, integrator: Integrator[Any], ends: Tensor) -> Iterator[Detour]:
+    """Those of worlds that have made easier steps: which `[*batch]`, to ends `[*batch, nq]`."""
     for k in which[which > 0].unique().tolist():
-        index = (which == k).nonzero().squeeze(-1)
-        yield _taken(batch, index, integrator.easier[k - 1], (Way(ends[index]),))
+        worlds = Worlds(tuple(which.shape), _where(which == k))
+        yield _taken(worlds, integrator.easier[k - 1], (Way(worlds.rows(ends)),))
 
 
-def _taken(batch: tuple[int, ...], index: Tensor, scheme: Integrator[Any], legs: tuple[Way, ...]) -> Detour:
-    return Detour(Worlds(batch, index), torch.ones(len(index), dtype=torch.bool), scheme, legs)
+def _where(which: Tensor) -> Tensor:
+    """The positions of some worlds `[*batch]` in the flattened batch."""
+    return which.reshape(-1).nonzero().squeeze(-1)
+
+
+def _taken(worlds: Worlds, scheme: Integrator[Any], legs: tuple[Way, ...]) -> Detour:
+    return Detour(worlds, torch.ones(len(worlds.index), dtype=torch.bool), scheme, legs)

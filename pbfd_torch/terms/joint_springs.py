@@ -102,7 +102,7 @@ class JointSprings(_Pull):
         return self.stiffness
 
     def taken_at(self, share: Tensor) -> Self:
-        """θ of the springs, at q_n + θ (q − q_n), θ `[*, nv]`; 1 for ball and free joints."""
+        """θ of the springs, at q_n + θ (q − q_n), θ `[*, nv]`; 1 for rotations of ball and free joints."""
         return replaced(self, share=share)
 
     def take(self, worlds: Worlds) -> Self:

@@ -61,16 +61,21 @@ inline void turning_loads(const Plan<N, D>& plan, int k, const JointStep<V>& ste
     if (!there) continue;
     const V back[4] = {aim[turn], -aim[turn + 1], -aim[turn + 2], -aim[turn + 3]};
     V gap[6], between[4], bent[9];
-    for (int j = 0; j < turn; j++) gap[j] = q[c + j] - aim[j];
+    V share[6];
+    for (int j = 0; j < size; j++) share[j] = what == 2 ? V(1) : step.fitted[i + j];
+    for (int j = 0; j < turn; j++) {
+      const V start = what == 0 ? step.start[c + j] : aim[j];  // springs are taken on the way
+      gap[j] = fma(what == 0 ? share[j] : V(1), q[c + j] - start, start - aim[j]);
+    }
     quaternion_product(back, q + c + turn, between);
     quaternion_log(between, gap + turn);
     if (matrix) log_jacobian(gap + turn, zero, bent);
     for (int j = 0; j < size; j++) {
-      const V own = V(number[j]) * (what == 0 ? V(1) : what == 1 ? per_dt : step.weight);
+      const V own = share[j] * V(number[j]) * (what == 0 ? V(1) : what == 1 ? per_dt : step.weight);
       if (residual) residual[i + j] = fma(own, gap[j], residual[i + j]);
       if (!matrix) continue;
       V* row = matrix + n * (i + j) + i;
-      if (j < turn) row[j] += own;
+      if (j < turn) row[j] += what == 0 ? share[j] * own : own;
       for (int b = 0; j >= turn && b < 3; b++) row[turn + b] = fma(own, bent[3 * (j - turn) + b], row[turn + b]);
     }
   }
