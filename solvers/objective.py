@@ -16,6 +16,7 @@ from torch import Tensor
 class Status(enum.IntEnum):
     """How one world's solve ended."""
 
+    EXPLICIT = -1  # nothing touched: made without an equation to solve
     SOLVED = 0
     WARM_STARTED = 1  # solved, from a minimiser: of the energy with lagged friction, or of ½‖r‖²
     CONTINUED = 2  # solved, by continuation in the friction's width or in stiffness
@@ -149,6 +150,7 @@ class Solution:
     iterations: `[*batch]` int, steps taken.
     evaluations: `[*batch]` int, evaluations of the residual spent.
     fallbacks: `[*batch, 4]` int, how often each of `FALLBACKS` was tried.
+    estimate: `[*batch]` [m], how far the end is off in worlds whose step was explicit, else 0; None: in none.
     steps: `[*batch]` int, steps of a world that chooses their length itself; None: one for all.
     lanes: evaluations that the schedule spent on all worlds together, those on finished worlds included.
     """
@@ -159,6 +161,7 @@ class Solution:
     iterations: Tensor
     evaluations: Tensor
     fallbacks: Tensor
+    estimate: Tensor | None = None
     steps: Tensor | None = None
     lanes: int = 0
 

@@ -12,7 +12,7 @@ from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models import SCENES
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.schedules.adaptive import apart
+from pbfd_torch.balance.dynamics import apart
 from pbfd_torch.simulator import AdaptiveSimulator
 from pbfd_torch.tree.kinematics import retract
 

@@ -1,4 +1,5 @@
-"""The equations of motion as functions: mass matrix, inverse dynamics, forward dynamics, energy and momentum."""
+"""The equations of motion as functions: mass matrix, inverse dynamics, forward dynamics, energy and momentum, and how far
+motions are apart."""
 
 from __future__ import annotations
 
@@ -90,3 +91,15 @@ def potential_energy(placement: Placement, gravity: Tensor) -> Tensor:
     """−m g · x of the centre of mass [J] `[*batch]`: zero at the world's origin."""
     mass = placement.articulation.mass.sum(-1)
     return -mass * (gravity * center_of_mass(placement)).sum(-1)
+
+
+def apart(articulation: Articulation, first: Tensor, second: Tensor) -> Tensor:
+    """How far two configurations are apart [m] `[*batch]`: √(tr(D S Dᵀ)/m), D the difference of a body's poses, of the body for
+    which it is the largest. Links that are fixed to each other are one body; those without mass do not count."""
+    t = articulation.topology
+    moved = (place(articulation, first).poses - place(articulation, second).poses)[..., :3, :]
+    square = ((moved @ articulation.pseudo_inertia) * moved).sum((-2, -1))
+    body = torch.tensor(t.link_node, device=first.device)
+    square, mass = (x.new_zeros(*x.shape[:-1], t.njoint + 1).index_add(-1, body, x) for x in (square, articulation.mass))
+    heavy = mass > 0
+    return torch.where(heavy, square / torch.where(heavy, mass, torch.ones_like(mass)), 0.0).amax(-1).clamp_min(0).sqrt()

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.integrator import S
+from pbfd_torch.integrators.integrator import Leaping, S
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.plain import plain
@@ -168,8 +168,10 @@ def _along(
 ) -> tuple[S, Tensor]:
     """One step, or several shorter ones in place of it."""
     integrator, a = stepper.integrator, stepper.articulation
-    if len(legs) == 1:
+    if len(legs) == 1 and not legs[0].detours:
         objective = stepper.objective(state, control)
+        if legs[0].explicit and isinstance(integrator, Leaping):
+            return integrator.leap(stepper.scene.terms, objective, state).end, torch.zeros_like(state.time, dtype=torch.bool)
         q, factors = attached(objective, _resolved(objective, legs[0].q), blur, kept[0] if kept else None)
         if kept is not None and not kept:
             kept.append(factors.plain())

@@ -193,6 +193,14 @@ class EnergyMomentum:
         fast = objective.turned(place(objective.articulation, end.q), FAST).any(-1)
         return torch.where(solved & self._overdrawn(end) & fast, PATIENCE, free.to(torch.int32))
 
+    def extrapolated(self, articulation: Articulation, whole: Velocities, middle: Velocities, end: Velocities) -> Velocities:
+        """See `Extrapolating`: (4 x(Δt/2) − x(Δt))/3, of fourth order."""
+        struck = torch.stack([(x.push != 0).any(-1) for x in (whole, middle, end)]).any(0)[..., None]
+        q = retract(articulation, end.q, difference(articulation, whole.q, end.q) / 3)
+        first, last = (x.v + 0.5 * x.lag for x in (whole, end))
+        v = end.v + (last - first) / 3
+        return replaced(end, q=torch.where(struck, end.q, q), v=torch.where(struck, end.v, v))
+
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""
         share = (new / dt)[..., None]

@@ -68,15 +68,22 @@ class Fitted:
 def fitted(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Sequence[Term]:
     """The terms, with those that can be `Fitted` to the stiffness z = Δt² (∂r/∂q)/m that all of them have together, m as in
     `felt_inertia`."""
+    z = stiffness(articulation, terms, dt)
+    if z is None:
+        return terms
+    turning = torch.zeros_like(articulation.topology.turns).index_fill(0, articulation.topology.turning_v.flatten(), True)
+    share = torch.where(turning & (z > 0), 1.0, fit(z))  # where coordinates do not add up
+    return [Fitted(term.taken_at(share), share) if isinstance(term, Fittable) else term for term in terms]
+
+
+def stiffness(articulation: Articulation, terms: Sequence[Term], dt: Tensor) -> Tensor | None:
+    """z `[*, nv]` of all `Fittable` terms; None: there are none."""
     able = [term for term in terms if isinstance(term, Fittable)]
     if not able:
-        return terms
+        return None
     felt = felt_inertia(articulation, terms)
     slope = sum((term.slope(articulation, dt) for term in able), torch.zeros_like(felt))
-    share = fit((dt * dt)[..., None] * slope / felt)
-    turning = torch.zeros_like(articulation.topology.turns).index_fill(0, articulation.topology.turning_v.flatten(), True)
-    share = torch.where(turning & (slope > 0), 1.0, share)  # where coordinates do not add up
-    return [Fitted(term.taken_at(share), share) if isinstance(term, Fittable) else term for term in terms]
+    return (dt * dt)[..., None] * slope / felt
 
 
 def felt_inertia(articulation: Articulation, terms: Sequence[Term]) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Generic, Protocol, Self, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -130,6 +130,46 @@ class Integrator(Protocol[S]):
 
     def resized(self, articulation: Articulation, state: S, dt: Tensor, new: Tensor) -> S:
         """The state as seen by steps of another length: at the same place with the same velocity."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Leap(Generic[S]):
+    """An explicit step of all worlds.
+
+    Attributes:
+        end: the state after it.
+        kept: `[*batch]` bool, which may go on from there.
+        error: `[*batch]` [m], how far its end is off, as estimated; see `apart`.
+        evaluations: of what moves the bodies.
+    """
+
+    end: S
+    kept: Tensor
+    error: Tensor
+    evaluations: int
+
+
+@runtime_checkable
+class Leaping(Protocol[S]):
+    """An integrator that can do without solving where nothing touches."""
+
+    @property
+    def otherwise(self) -> Integrator[S]:
+        """What makes the steps of the other worlds, from the same kind of state."""
+        ...
+
+    def leap(self, terms: Sequence[Term], objective: BalanceObjective, state: S) -> Leap[S]:
+        """The explicit step from a state, of the step and the loads that an objective is of; terms: of the scene."""
+        ...
+
+
+@runtime_checkable
+class Extrapolating(Protocol[S]):
+    """An integrator whose error has an even expansion in the step."""
+
+    def extrapolated(self, articulation: Articulation, whole: S, middle: S, end: S) -> S:
+        """What the ends of a step and of its two halves say together; the halves' end where something has pushed."""
         ...
 
 

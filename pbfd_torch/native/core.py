@@ -45,6 +45,8 @@ class _Steps(ctypes.Structure):
         *((name, ctypes.c_double) for name in ("accuracy", "shortest")),
         *((name, ctypes.c_void_p) for name in ("wish", "pace", "spacing", "made")),
         ("before_last", ctypes.c_void_p * 10),
+        ("trust", ctypes.c_double),
+        ("estimate", ctypes.c_void_p),
     )
 
 
@@ -52,7 +54,7 @@ class _Steps(ctypes.Structure):
 class Terms:
     """What is asked of steps. dt [s], `[]`, or `[*batch]` of each world; halvings: how often they may be halved; tolerance of
     ‖r/scale‖; surplus: see `EnergyMomentum`; share: see `Variational`, 1 for implicit Euler; jump: see `Bdf2`; evaluations: at
-    most, of each with all that is tried."""
+    most, of each with all that is tried; trust: see `RungeKutta`, 0: no step is explicit."""
 
     dt: Tensor
     halvings: int
@@ -61,6 +63,7 @@ class Terms:
     share: float
     jump: float
     evaluations: int
+    trust: float = 0.0
 
 
 class Journey:
@@ -97,6 +100,7 @@ class Journey:
         first, *others = COUNTED
         self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
         self.counted |= {name: torch.empty_like(self.counted[first]) for name in others}
+        self._estimate: Tensor | None = None  # of explicit steps
         self.fallbacks = torch.empty((*steps, *batch, len(FALLBACKS)), dtype=torch.int32)
 
     def call(self, terms: Terms) -> _Steps:
@@ -112,6 +116,10 @@ class Journey:
         asked.counted[:] = [x.data_ptr() for x in self.counted.values()]
         asked.residual_norm, asked.fallbacks = self.residual_norm.data_ptr(), self.fallbacks.data_ptr()
         asked.own = self.own.data_ptr()
+        asked.trust = terms.trust
+        if terms.trust > 0 and self.frames is None:
+            self._estimate = torch.empty_like(self.residual_norm)
+            asked.estimate = self._estimate.data_ptr()
         asked.poses, asked.timed = self.poses.data_ptr(), self.poses.shape[1]
         if self.ways is not None:
             asked.halved, asked.eased, asked.ends = (x.data_ptr() for x in (self.ways.halved, self.ways.eased, self.ways.ends))
@@ -136,7 +144,13 @@ class Journey:
         lanes = int(counted["evaluations"].sum())
         steps = None if self.frames is None else self.frames.made
         return Solution(
-            self.found["q"], residual_norm=self.residual_norm, fallbacks=self.fallbacks, lanes=lanes, steps=steps, **counted
+            self.found["q"],
+            residual_norm=self.residual_norm,
+            fallbacks=self.fallbacks,
+            lanes=lanes,
+            estimate=self._estimate,
+            steps=steps,
+            **counted,
         )
 
 

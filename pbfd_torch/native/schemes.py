@@ -13,6 +13,7 @@ from pbfd_torch.integrators.bdf2 import Bdf2, FourPoses
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler, Positions
 from pbfd_torch.integrators.integrator import State
+from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.calls import whole
 from pbfd_torch.native.plan import Plan
@@ -73,13 +74,15 @@ ON_POSITIONS = Scheme(
     *("pbfd_implicit_euler", "pbfd_start_implicit_euler", Positions),
     {"q": COORDINATE, "q_previous": COORDINATE, "acceleration": FREEDOM},
 )
+WITH_VELOCITIES = Scheme(
+    *("pbfd_energy_momentum", "pbfd_start_energy_momentum", Velocities),
+    {"q": COORDINATE}
+    | dict.fromkeys(("v", "push", "steady", "lag", "average"), FREEDOM)
+    | dict.fromkeys(("gained", "surplus", "peak"), NUMBER),
+)
 SCHEMES: dict[type, Scheme] = {
-    EnergyMomentum: Scheme(
-        *("pbfd_energy_momentum", "pbfd_start_energy_momentum", Velocities),
-        {"q": COORDINATE}
-        | dict.fromkeys(("v", "push", "steady", "lag", "average"), FREEDOM)
-        | dict.fromkeys(("gained", "surplus", "peak"), NUMBER),
-    ),
+    EnergyMomentum: WITH_VELOCITIES,
+    RungeKutta: WITH_VELOCITIES,
     ImplicitEuler: ON_POSITIONS,
     Variational: ON_POSITIONS,
     Bdf2: _OnPoses(

@@ -16,6 +16,7 @@ from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import Positions
 from pbfd_torch.integrators.integrator import Integrator, S, fresh
+from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.carriers import passed
 from pbfd_torch.native.core import Core, Journey, Terms
@@ -63,11 +64,12 @@ class NativeStepper(Generic[S]):
         assert isinstance(eager.solver, Fallbacks)
         tolerance = eager.solver.direct.tolerance_for(eager.articulation.dtype)
         share = scheme.share if isinstance(scheme, Variational) else 1.0
+        trust = scheme.trust if isinstance(scheme, RungeKutta) else 0.0
         jump = scheme.jump if isinstance(scheme, Bdf2) else math.inf
         halvings = eager.halvings
         while halvings and eager.dt / 2**halvings < SHORTEST_STEP:
             halvings -= 1
-        terms = Terms(eager.step_size.detach(), halvings, tolerance, surplus, share, jump, eager.evaluations)
+        terms = Terms(eager.step_size.detach(), halvings, tolerance, surplus, share, jump, eager.evaluations, trust)
         self._scheme: Scheme = SCHEMES[type(scheme)]
         self._core = Core(compiled, plan, self._scheme, terms, self.threads)
 

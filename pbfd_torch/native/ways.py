@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.integrators.integrator import Integrator
+from pbfd_torch.solvers.objective import Status
 from pbfd_torch.stepping.way import Detour, Way
 from pbfd_torch.tensors.worlds import Worlds
 
@@ -18,7 +19,7 @@ class Ways:
 
     Attributes:
         halved: `[*batch]` int.
-        eased: `[*batch, parts]` int, which of the easier steps each part is; 0: the scheme's own.
+        eased: `[*batch, parts]` int, which of the easier steps each part is; 0: the scheme's own, −1: that was explicit.
         ends: `[*batch, parts, nq]`.
     """
 
@@ -32,6 +33,9 @@ class Ways:
         """That of steps which end at q `[*batch, nq]`."""
         if not bool((self.halved | self.eased[..., 0]).any()):  # as most steps are
             return Way(q)
+        explicit = (self.eased[..., 0] == int(Status.EXPLICIT)) & (self.halved == 0)
+        if bool(explicit.all()):
+            return Way(q, explicit=True)
         detours = list(_eased(torch.where(self.halved == 0, self.eased[..., 0], 0), integrator, self.ends[..., 0, :]))
         for times in self.halved[self.halved > 0].unique().tolist():
             worlds = Worlds(tuple(self.halved.shape), _where(self.halved == times))
@@ -39,6 +43,9 @@ class Ways:
             parts = range(2**times)
             legs = tuple(Way(ends[..., k, :], tuple(_eased(eased[..., k], integrator, ends[..., k, :]))) for k in parts)
             detours.append(_taken(worlds, integrator, legs))
+        if bool(explicit.any()):
+            worlds = Worlds(tuple(explicit.shape), _where(explicit))
+            detours.append(_taken(worlds, integrator, (Way(worlds.rows(q), explicit=True),)))
         return Way(q, tuple(detours))
 
 

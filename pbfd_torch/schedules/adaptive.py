@@ -1,7 +1,8 @@
 """Steps of their own for every world: a user asks for an accuracy, and each world finds the Δt that gives it.
 
-Every step is made twice, whole and as two halves. The halves are kept; how far both end apart is the error estimate. A world goes
-on with the step that its own error asks for and never waits for another one but at the ends of the frames, where its control
+Every step is made twice, whole and as two halves; how far both end apart is the error estimate. What both say together is kept,
+which is of fourth order, or the halves where something has pushed. Explicit steps (`RungeKutta`) know their error without halves. A
+world goes on with the step that its own error asks for and never waits for another one but at the ends of the frames, where its control
 changes and its state is recorded.
 """
 
@@ -9,13 +10,15 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from dataclasses import dataclass
 from typing import Generic, Self
 
 import torch
 from torch import Tensor
 
+from pbfd_torch.balance.dynamics import apart
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.integrator import Extrapolating, Integrator, S
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.accuracy import Accuracy
@@ -23,11 +26,9 @@ from pbfd_torch.stepping.stepper import Solver, Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
-from pbfd_torch.tree.articulation import Articulation
-from pbfd_torch.tree.kinematics import place
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
-ORDER = 3  # of the error of one step
+ORDER, EXPLICIT_ORDER = 3.0, 5.0  # of the error of one step
 
 
 class AdaptiveStepper(Generic[S]):
@@ -110,7 +111,7 @@ class _Frame(Generic[S]):
         self._spacing = like + stepper.dt  # the step that the state's history is for
         self._solution = Solution(
             q=state.q,
-            status=none,
+            status=torch.full_like(none, int(Status.EXPLICIT)),
             residual_norm=like,
             iterations=none,
             evaluations=none,
@@ -128,51 +129,47 @@ class _Frame(Generic[S]):
         now, spacing, left = self._state.take(worlds), worlds.rows(self._spacing), worlds.rows(left)
         h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left) - 1e-6)
         held = None if self._control is None else worlds.pick(self._control, 1)
-        part, integrator = self._fixed.take(worlds), self._fixed.integrator
-        a = part.scene.articulation
-        whole, half = part.sized(h), part.sized(0.5 * h)
-        coarse, first, _ = whole.made(integrator.resized(a, now, spacing, h), held)
-        middle, second, _ = half.made(integrator.resized(a, now, spacing, 0.5 * h), held)
-        end, third, _ = half.made(middle, held)
-        end = replaced(end, hazards=now.hazards | middle.hazards | end.hazards)
+        tried = _tried(self._fixed.take(worlds), now, spacing, h, held)
 
-        error, accuracy = apart(a, coarse.q, end.q), self._stepper.accuracy
-        broken = third.status == int(Status.NON_FINITE)
+        accuracy, solution = self._stepper.accuracy, tried.solution
+        broken = solution.status == int(Status.NON_FINITE)
         shortest = h <= 1.001 * accuracy.shortest  # not but for rounding
-        taken = broken | shortest | ((error <= accuracy.length) & second.solved & third.solved)
-        factor = (SAFETY * (accuracy.length / error) ** (1 / ORDER)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
+        taken = broken | shortest | ((tried.error <= accuracy.length) & solution.solved)
+        order = torch.where(tried.explicit, EXPLICIT_ORDER, ORDER)
+        factor = (SAFETY * (accuracy.length / tried.error) ** (1 / order)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
         factor = torch.where(taken, factor, factor.clamp_max(0.5))
         pace = (h * factor).clamp(accuracy.shortest, self._stepper.dt)
 
         everywhere = torch.ones_like(taken)
         self._elapsed = put(self._elapsed, worlds.rows(self._elapsed) + torch.where(broken, left, h), worlds, taken)
         self._pace = put(self._pace, pace, worlds, everywhere)
-        self._spacing = put(self._spacing, 0.5 * h, worlds, taken)
-        self._before = put(self._before, middle, worlds, taken)
-        self._state = put(self._state, end, worlds, taken)
-        self._count(worlds, taken, (first, second, third))
+        self._spacing = put(self._spacing, torch.where(tried.explicit, h, 0.5 * h), worlds, taken)
+        self._before = put(self._before, tried.before_last, worlds, taken)
+        self._state = put(self._state, tried.end, worlds, taken)
+        self._count(worlds, taken, tried)
         return True
 
-    def _count(self, worlds: Worlds, taken: Tensor, tries: tuple[Solution, Solution, Solution]) -> None:
+    def _count(self, worlds: Worlds, taken: Tensor, tried: _Tried[S]) -> None:
         """All that was tried costs; how well the worlds are solved is said by what they keep."""
-        total = self._solution
-        kept = tries[1:]
-        worst = torch.stack([x.status for x in kept]).amax(0)
-        error = torch.stack([x.residual_norm for x in kept]).amax(0)
+        total, found = self._solution, tried.solution
         everywhere = torch.ones_like(taken)
+        made = torch.where(taken, torch.where(tried.explicit, 1, 2), 0)
 
-        def added(old: Tensor, values: list[Tensor]) -> Tensor:
-            return put(old, worlds.rows(old) + torch.stack(values).sum(0, dtype=old.dtype), worlds, everywhere)
+        def worst(old: Tensor, new: Tensor) -> Tensor:
+            return put(old, torch.maximum(worlds.rows(old), new), worlds, taken)
+
+        def added(old: Tensor, new: Tensor) -> Tensor:
+            return put(old, worlds.rows(old) + new.to(old.dtype), worlds, everywhere)
 
         self._solution = dataclasses.replace(
             total,
-            status=put(total.status, torch.maximum(worlds.rows(total.status), worst), worlds, taken),
-            residual_norm=put(total.residual_norm, torch.maximum(worlds.rows(total.residual_norm), error), worlds, taken),
-            iterations=added(total.iterations, [x.iterations for x in tries]),
-            evaluations=added(total.evaluations, [x.evaluations for x in tries]),
-            fallbacks=added(total.fallbacks, [x.fallbacks for x in tries]),
-            steps=added(torch.zeros_like(total.status) if total.steps is None else total.steps, [2 * taken.to(torch.int32)]),
-            lanes=total.lanes + sum(x.lanes for x in tries),
+            status=worst(total.status, found.status),
+            residual_norm=worst(total.residual_norm, found.residual_norm),
+            iterations=added(total.iterations, found.iterations),
+            evaluations=added(total.evaluations, found.evaluations),
+            fallbacks=added(total.fallbacks, found.fallbacks),
+            steps=added(torch.zeros_like(total.status) if total.steps is None else total.steps, made),
+            lanes=total.lanes + found.lanes,
         )
 
     def finish(self) -> tuple[S, Solution, Way]:
@@ -185,13 +182,64 @@ class _Frame(Generic[S]):
         return replaced(state, pace=self._pace), dataclasses.replace(self._solution, q=state.q), way
 
 
-def apart(articulation: Articulation, first: Tensor, second: Tensor) -> Tensor:
-    """How far two configurations are apart [m] `[*batch]`: √(tr(D S Dᵀ)/m), D the difference of a body's poses, of the body for
-    which it is the largest. Links that are fixed to each other are one body; those without mass do not count."""
-    t = articulation.topology
-    moved = (place(articulation, first).poses - place(articulation, second).poses)[..., :3, :]
-    square = ((moved @ articulation.pseudo_inertia) * moved).sum((-2, -1))
-    body = torch.tensor(t.link_node, device=first.device)
-    square, mass = (x.new_zeros(*x.shape[:-1], t.njoint + 1).index_add(-1, body, x) for x in (square, articulation.mass))
-    heavy = mass > 0
-    return torch.where(heavy, square / torch.where(heavy, mass, torch.ones_like(mass)), 0.0).amax(-1).clamp_min(0).sqrt()
+@dataclass(frozen=True, eq=False)
+class _Tried(Generic[S]):
+    """A step of `n` worlds, made as a whole and, where that was not explicit, again as two halves.
+
+    Attributes:
+        explicit: `[n]` bool.
+        error: `[n]` [m], how far the step is off.
+        before_last, end: the states around the last of the steps that are to be kept: the whole one, or the second half.
+        solution: with the worst status and error of these steps, and what all that was made has cost.
+    """
+
+    explicit: Tensor
+    error: Tensor
+    before_last: S
+    end: S
+    solution: Solution
+
+
+def _tried(stepper: Stepper[S], state: S, spacing: Tensor, h: Tensor, control: Tensor | None) -> _Tried[S]:
+    """A step of length h `[n]` from a state whose history is for steps of `spacing`."""
+    integrator, a = stepper.integrator, stepper.scene.articulation
+    start = integrator.resized(a, state, spacing, h)
+    coarse, first, _ = stepper.sized(h).made(start, control)
+    explicit = first.status == int(Status.EXPLICIT)
+    error = torch.zeros_like(h) if first.estimate is None else first.estimate
+    whole = _Tried(explicit, error, start, replaced(coarse, hazards=state.hazards | coarse.hazards), first)
+    index = (~explicit).nonzero().squeeze(-1)
+    if len(index) == 0:
+        return whole
+    worlds, everywhere = Worlds(tuple(explicit.shape), index), torch.ones_like(index, dtype=torch.bool)
+    half = stepper.take(worlds).sized(0.5 * worlds.rows(h))
+    a, before = half.scene.articulation, state.take(worlds)
+    held = None if control is None else worlds.pick(control, 1)
+    begin = integrator.resized(a, before, worlds.rows(spacing), half.step_size)
+    middle, second, _ = half.made(begin, held)
+    end, third, _ = half.made(middle, held)
+    rough = coarse.take(worlds)
+    off = apart(a, rough.q, end.q)
+    if isinstance(integrator, Extrapolating):
+        end = integrator.extrapolated(a, rough, middle, end)
+    end = replaced(end, hazards=before.hazards | middle.hazards | end.hazards)
+
+    def added(old: Tensor, one: Tensor, other: Tensor) -> Tensor:
+        return put(old, worlds.rows(old) + one + other, worlds, everywhere)
+
+    solution = dataclasses.replace(
+        first,
+        status=put(first.status, torch.maximum(second.status, third.status), worlds, everywhere),
+        residual_norm=put(first.residual_norm, torch.maximum(second.residual_norm, third.residual_norm), worlds, everywhere),
+        iterations=added(first.iterations, second.iterations, third.iterations),
+        evaluations=added(first.evaluations, second.evaluations, third.evaluations),
+        fallbacks=added(first.fallbacks, second.fallbacks, third.fallbacks),
+        lanes=first.lanes + second.lanes + third.lanes,
+    )
+    return _Tried(
+        explicit,
+        put(whole.error, off, worlds, everywhere),
+        put(whole.before_last, middle, worlds, everywhere),
+        put(whole.end, end, worlds, everywhere),
+        solution,
+    )

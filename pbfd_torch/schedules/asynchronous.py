@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.errors import InputError
-from pbfd_torch.integrators.integrator import State
+from pbfd_torch.integrators.integrator import Leaping, State
 from pbfd_torch.records.recording import Recorder
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.solvers.descent import Descent, renewed
@@ -52,6 +52,9 @@ class AsynchronousRollout:
         solver = stepper.first_solver
         if not isinstance(solver, Descent):
             raise InputError(f"the solver is a {type(solver).__name__}: must be a Descent or Fallbacks")
+        if isinstance(stepper.integrator, Leaping):
+            name = type(stepper.integrator).__name__
+            raise InputError(f"the integrator is {name}, whose explicit steps wait for nobody: leave out the asynchronous schedule")
         self._direct = solver
         if state.q.ndim != 2:
             raise InputError(f"q has shape {tuple(state.q.shape)}: must be [worlds, nq]")

@@ -16,7 +16,7 @@ from pbfd_torch.balance.objective import BalanceObjective, blank_memory
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
-from pbfd_torch.integrators.integrator import Integrator, S, State, Trial, calm
+from pbfd_torch.integrators.integrator import Integrator, Leaping, S, State, Trial, calm
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks, doubted, merged
@@ -169,11 +169,44 @@ class EagerStepper(Generic[S]):
         with torch.no_grad():
             start = self.departing(state, control)
             objective = self.objective(start, control)
+            if isinstance(self.integrator, Leaping):
+                advanced, solution, way = self._leapt(self.integrator, objective, start, control)
+                return *self.arrived(state, advanced, solution), way
             solution = self.first_solver.solve(objective, objective.guess, start.q)
             advanced, refusal = self.integrator.advance(objective, start, solution.q)
             refused = None if refusal is None else refusal()
             advanced, solution, way = self.finished(objective, start, control, solution, advanced, refused)
             return *self.arrived(state, advanced, solution), way
+
+    def _leapt(
+        self, integrator: Leaping[S], objective: BalanceObjective, state: S, control: Tensor | None
+    ) -> tuple[S, Solution, Way]:
+        """The explicit step, and that of the other scheme in the worlds that may not make it."""
+        leap = integrator.leap(self.scene.terms, objective, state)
+        none = torch.zeros_like(leap.error)
+        count = torch.full_like(none, leap.evaluations, dtype=torch.int32)
+        advanced, q = leap.end, leap.end.q
+        solution = Solution(
+            q=q,
+            status=torch.full_like(count, int(Status.EXPLICIT)),
+            residual_norm=none,
+            iterations=torch.zeros_like(count),
+            evaluations=count,
+            fallbacks=count.new_zeros((*count.shape, len(FALLBACKS))),
+            estimate=leap.error,
+        )
+        index = (~leap.kept).reshape(-1).nonzero().squeeze(-1)
+        if len(index) == 0:
+            return advanced, solution, Way(q, (), objective, explicit=True)
+        worlds, other = Worlds(tuple(count.shape), index), integrator.otherwise
+        everywhere = torch.ones_like(index, dtype=torch.bool)
+        part = self.take(worlds).changed(integrator=other)
+        end, found, leg = part.made(state.take(worlds), None if control is None else worlds.pick(control, 1))
+        found = dataclasses.replace(found, evaluations=found.evaluations + leap.evaluations, estimate=torch.zeros_like(end.time))
+        whole = put(dataclasses.replace(solution, lanes=0), dataclasses.replace(found, lanes=0), worlds, everywhere)
+        solution = dataclasses.replace(whole, lanes=leap.evaluations * count.numel() + found.lanes)
+        detour = Detour(worlds, everywhere, other, (leg.kept(),))
+        return put(advanced, end, worlds, everywhere), solution, Way(q, (detour,), objective, explicit=True)
 
     def departing(self, state: S, control: Tensor | None) -> S:
         """The state with NaN for the configuration of worlds that are to stand still in its step; see `stepping.standstill`."""

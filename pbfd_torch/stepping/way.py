@@ -36,15 +36,17 @@ class Way:
     q: `[*batch, nq]` where the equations of the step itself left each world.
     detours: what was tried after it, the last one that a world keeps being the one that counts.
     objective: the balance of the step itself, for records of its contacts; None: not kept.
+    explicit: q is where the integrator's explicit step has led.
     """
 
     q: Tensor
     detours: tuple[Detour, ...] = field(default=())
     objective: BalanceObjective | None = None
+    explicit: bool = False
 
     def kept(self) -> Way:
         """The way as derivatives keep it: without the balance, which they make anew."""
-        return Way(self.q, self.detours)
+        return Way(self.q, self.detours, explicit=self.explicit)
 
     def groups(self, included: Tensor | None) -> Iterator[tuple[Worlds | None, Detour | None, tuple[Way, ...]]]:
         """The worlds that have gone the same way, each with the detour that they kept (None: the step itself) and its legs for
@@ -69,7 +71,7 @@ class Way:
                 continue
             worlds = Worlds(batch, index)
             if way is None:
-                yield worlds, None, (Way(worlds.rows(self.q)),)
+                yield worlds, None, (Way(worlds.rows(self.q), explicit=self.explicit),)
             else:
                 yield worlds, way, tuple(leg.take(place[index]) for leg in way.legs)
 
@@ -91,7 +93,7 @@ class Way:
                         tuple(leg.take(inside) for leg in detour.legs),
                     )
                 )
-        return Way(worlds.rows(self.q), tuple(detours))
+        return Way(worlds.rows(self.q), tuple(detours), explicit=self.explicit)
 
     def repeated(self, count: int) -> Way:
         """The same for `count` copies of the batch, as `[count, *batch]`."""
@@ -106,7 +108,7 @@ class Way:
             )
             for detour in self.detours
         )
-        return Way(self.q.expand(count, *self.q.shape), detours)
+        return Way(self.q.expand(count, *self.q.shape), detours, explicit=self.explicit)
 
 
 def _flat(way: Way) -> Way:

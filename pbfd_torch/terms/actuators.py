@@ -15,7 +15,7 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.constants import indices
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
-from pbfd_torch.terms.load import JointLoad, StepContext
+from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.tree.articulation import Articulation, JointKind
 from pbfd_torch.tree.kinematics import Placement
 
@@ -182,15 +182,27 @@ class Actuators:
         return self.stiffness if self.share is None else self.share * self.stiffness
 
     def prepare(self, step: StepContext) -> PreparedActuators:
-        if step.control is None:
-            control = self.gain.new_zeros(self.nu)
-        elif step.control.shape[-1] != self.nu:
-            raise InputError(f"control has shape {tuple(step.control.shape)}: must end in ({self.nu},)")
-        else:
-            control = step.control
-        drive = self.gain * _clamped(control, self.control_range) + self.bias
+        drive = self._drive(step.control)
         spread = _spread(self.dof, step.previous.articulation, self.gear.dtype)
         return PreparedActuators(drive, 1 / step.dt[..., None], self.gear * step.previous.q[..., self.coordinate], spread)
+
+    def _drive(self, control: Tensor | None) -> Tensor:
+        """gain·u + bias."""
+        if control is None:
+            control = self.gain.new_zeros(self.nu)
+        elif control.shape[-1] != self.nu:
+            raise InputError(f"control has shape {tuple(control.shape)}: must end in ({self.nu},)")
+        return self.gain * _clamped(control, self.control_range) + self.bias
+
+    def flow(self, placement: Placement, v: Tensor, control: Tensor | None) -> JointLoad:
+        """See `Flowing`."""
+        x, speed = self.gear * placement.q[..., self.coordinate], self.gear * v[..., self.dof]
+        force = self._drive(control) - self.stiffness * x - self.damping * speed
+        low, high = self.force_range.unbind(-1)
+        slope = torch.where((force > low) & (force < high), self.stiffness * self.gear * self.gear, torch.zeros_like(force))
+        spread = _spread(self.dof, placement.articulation, self.gear.dtype)
+        force = self.gear * _clamped(force, self.force_range)
+        return diagonal_load(-(force[..., None, :] @ spread).squeeze(-2), (slope[..., None, :] @ spread).squeeze(-2))
 
     def load(self, prepared: PreparedActuators, placement: Placement) -> JointLoad:
         moved = self.gear * placement.q[..., self.coordinate] - prepared.previous

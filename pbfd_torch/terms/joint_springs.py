@@ -11,7 +11,7 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.checks import require_non_negative
-from pbfd_torch.terms.load import JointLoad, StepContext
+from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.tree.articulation import Articulation
 from pbfd_torch.tree.kinematics import Placement, difference, retract
 from pbfd_torch.tree.rotations import log_jacobian_symmetric
@@ -97,6 +97,10 @@ class JointSprings(_Pull):
         a, start = placement.articulation, prepared.start
         return replaced(placement, q=retract(a, start, self.share * difference(a, start, placement.q)))
 
+    def flow(self, placement: Placement, v: Tensor, control: Tensor | None) -> JointLoad:
+        """See `Flowing`."""
+        return elastic_load(placement.articulation, self.stiffness, self.rest, placement.q)
+
     def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
         """∂r/∂q `[*, nv]`."""
         return self.stiffness
@@ -126,6 +130,10 @@ class JointDamping(_Pull):
 
     def prepare(self, step: StepContext) -> PreparedPull:
         return PreparedPull(self.damping / step.dt[..., None], step.previous.q)
+
+    def flow(self, placement: Placement, v: Tensor, control: Tensor | None) -> JointLoad:
+        """See `Flowing`."""
+        return diagonal_load(self.damping * v, torch.zeros_like(v))
 
     def slope(self, articulation: Articulation, dt: Tensor) -> Tensor:
         """∂r/∂q `[*, nv]`."""

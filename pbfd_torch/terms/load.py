@@ -187,6 +187,15 @@ class Foreboding(Protocol):
 
 
 @runtime_checkable
+class Flowing(Protocol):
+    """A term whose load is known at an instant, and changes smoothly."""
+
+    def flow(self, placement: Placement, v: Tensor, control: Tensor | None) -> Load:
+        """Its load where the velocity is v `[*batch, nv]` under a control `[*batch, nu]`; its stiffness is not asked for."""
+        ...
+
+
+@runtime_checkable
 class Pushing(Protocol):
     """A term that sets in abruptly when things meet."""
 

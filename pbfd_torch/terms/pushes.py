@@ -51,6 +51,10 @@ class Pushes:
         poses = placement.poses
         return LinkLoad(self._moment(poses), lambda: poses.new_zeros((*poses.shape[:-2], 6, 6)))
 
+    def flow(self, placement: Placement, v: Tensor, control: Tensor | None) -> LinkLoad:
+        """See `Flowing`."""
+        return self.load(None, placement)
+
     def take(self, worlds: Worlds) -> Self:
         """The same pushes of some worlds."""
         return replaced(self, force=worlds.pick(self.force, 2), point=worlds.pick(self.point, 2))

@@ -234,6 +234,19 @@ def retract(articulation: Articulation, q: Tensor, delta: Tensor) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.q_order]
 
 
+def coordinate_rates(articulation: Articulation, q: Tensor, v: Tensor) -> Tensor:
+    """q̇ `[*batch, nq]` of a velocity `[*batch, nv]`; quaternions, of any norm, turn by ½ q ⊗ ω and keep it."""
+    t = articulation.topology
+    parts = [v[..., t.scalar_v]]
+    if len(t.free_q):
+        parts.append(v[..., t.free_v].flatten(-2))
+    if len(t.turning_q):
+        turning = v[..., t.turning_v]
+        spin = torch.cat((torch.zeros_like(turning[..., :1]), turning), -1)
+        parts.append(0.5 * quaternion_multiply(q[..., t.turning_q], spin).flatten(-2))
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.q_order]
+
+
 def difference(articulation: Articulation, start: Tensor, end: Tensor) -> Tensor:
     """Tangent vector `[*batch, nv]` that takes `start` to `end`: retract(start, difference(start, end)) = end. Angles of ball and
     free joints come out in [0, π]; hinge angles are plain differences."""

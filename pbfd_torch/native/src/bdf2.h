@@ -22,6 +22,7 @@ template <class V, class N, int D> struct Bdf2 {
   using State = FourPoses<V>;
   static constexpr int easier = 1;  // implicit Euler, which forgets what was before it
   static constexpr bool fits = false;
+  static constexpr bool extrapolates = false, leaps = false;
   static double share(int) { return 1.0; }
 
   const Plan<N, D>& plan;

@@ -3,14 +3,13 @@
 #pragma once
 #include <cmath>
 #include "itinerary.h"
-#include "tree.h"
 
 namespace pbfd {
 
-constexpr double SAFETY = 0.9, SHRINK = 0.2, GROW = 3.0, ORDER = 3.0;  // of the error of one step
+constexpr double SAFETY = 0.9, SHRINK = 0.2, GROW = 3.0, ORDER = 3.0, EXPLICIT_ORDER = 5.0;  // of the error of one step
 
-// What a lane makes: a step as a whole, or one of its halves.
-enum Half { WHOLE, FIRST_HALF, SECOND_HALF };
+// What a lane makes: a step as a whole, or one of its halves; or it has made an explicit one, which knows its error without these.
+enum Half { WHOLE, FIRST_HALF, SECOND_HALF, AT_ONCE };
 
 // How far a lane is in a frame [s], and what that has cost.
 template <class T> struct Frame : Tally<T> {
@@ -23,7 +22,7 @@ template <class T> struct Frame : Tally<T> {
 
   void begin(T dt, T wish) {
     Tally<T>::begin();
-    length = spacing = dt, pace = wish, elapsed = T(0), made = 0;
+    length = spacing = dt, pace = wish, elapsed = T(0), made = 0, this->status = EXPLICIT;
     set_out();
   }
   void set_out() {
@@ -37,47 +36,30 @@ template <class T> struct Frame : Tally<T> {
   void add(const Tally<T>& tried) {
     this->evaluations += tried.evaluations, this->iterations += tried.iterations;
     for (int i = 0; i < FALLBACKS; i++) this->counts[i] += tried.counts[i];
+    if (half == WHOLE && tried.status == EXPLICIT) half = AT_ONCE, ended[0] = EXPLICIT;
     if (half == WHOLE) return;
-    ended[half - FIRST_HALF] = tried.status, seen |= tried.hazards;
+    ended[half != FIRST_HALF] = tried.status, seen |= tried.hazards;
     if (tried.error > reached) reached = tried.error;
   }
-  // Both halves are made, and the whole step ends so far off; whether they are kept.
+  // Both halves are made, or the step was explicit, and the whole step ends so far off; whether they are kept.
   bool judge(const Rules& rules, T off) {
     const T accuracy = T(rules.accuracy), shortest = T(rules.shortest);
     const int worst = ended[0] > ended[1] ? ended[0] : ended[1];
     const bool broken = ended[1] == NON_FINITE, solved = worst <= HALVED;
     const bool taken = broken || step <= T(1.001) * shortest || (off <= accuracy && solved);
-    T factor = T(SAFETY) * std::pow(accuracy / off, T(1 / ORDER));
+    T factor = T(SAFETY) * std::pow(accuracy / off, T(1 / (half == AT_ONCE ? EXPLICIT_ORDER : ORDER)));
     factor = factor < T(SHRINK) || factor != factor ? T(SHRINK) : factor > T(GROW) ? T(GROW) : factor;
     if (!taken && factor > T(0.5)) factor = T(0.5);
     const T wish = step * factor;
     pace = wish < shortest ? shortest : wish > length ? length : wish;
     if (!taken) return false;
-    elapsed = broken ? length : elapsed + step, spacing = T(0.5) * step, made += 2;
+    const T share = half == AT_ONCE ? T(1) : T(0.5);
+    elapsed = broken ? length : elapsed + step, spacing = share * step, made += half == AT_ONCE ? 1 : 2;
     this->hazards |= seen;
     if (worst > this->status) this->status = worst;
     if (reached > this->error) this->error = reached;
     return true;
   }
 };
-
-// How far two configurations are apart [m]: √(tr(D S Dᵀ)/m), D the difference of a body's poses, of the body for which it is the
-// largest. Bodies without mass do not count.
-template <class V, class N, int D> inline V apart(const Plan<N, D>& plan, const Poses<V>& one, const Poses<V>& other) {
-  V most(0);
-  for (int k = 0; k < plan.nodes; k++) {
-    V turned[D * D], moved[D], spread[D * D], square(0);
-    for (int i = 0; i < D * D; i++) turned[i] = one.rotation[D * D * k + i] - other.rotation[D * D * k + i];
-    times<D>(turned, plan.center + D * k, moved);
-    for (int i = 0; i < D; i++) moved[i] += one.position[D * k + i] - other.position[D * k + i];
-    product<D>(turned, plan.second + D * D * k, spread);
-    for (int i = 0; i < D * D; i++) square = fma(spread[i], turned[i], square);
-    const V mass = V(plan.mass[k]);
-    const auto heavy = mass > V(0);
-    const V off = dot<D>(moved, moved) + square / select(heavy, mass, V(1));
-    most = select(heavy, max(most, off), most);
-  }
-  return sqrt(max(most, V(0)));
-}
 
 }  // namespace pbfd

@@ -19,6 +19,7 @@ template <class V, class N, int D> struct ImplicitEuler {
   using M = typename Kind<V>::Mask;
   using State = Positions<V>;
   static constexpr bool fits = false;
+  static constexpr bool extrapolates = false, leaps = false;
   static constexpr double BLENDS[] = {0.25, 0.5, 0.75, 1.0};  // what is easier to solve
 
   const Plan<N, D>& plan;

@@ -40,6 +40,7 @@ template <class T> struct Journey {
   Timetable<T> timetable;
   Ways<T> ways;
   Frames<T> frames;
+  T* estimate;  // of explicit steps; null: there are none
 
   long at(int step, int world) const { return long(step) * worlds + world; }
   T step(int world) const { return dt[alike ? 0 : world]; }

@@ -25,11 +25,11 @@ template <class V, class N, int D, class Scheme> struct Machine {
   State before, after, origin, best;  // of the attempt; of the whole step
   State base, middle, last;           // of a frame: before and half way through the step, and before the last part that is kept
   Poses<V> reached[2];                // of the step as a whole, and of its halves
-  V *guess, *from, *found, *velocity, *coarse, *axes;
+  V *guess, *from, *found, *velocity, *coarse, *coarse_speed, *axes;
 
   static int room(Sizes s) {
     return Newton<V, N, D>::room(s) + Sight<V, N, D>::room(s) + Scheme::room(s) + 7 * room_for<State>(s) + 4 * s.nq +
-           2 * (D * D + D) * s.nodes + (1 + turns(D) + D) * s.nv;
+           2 * (D * D + D) * s.nodes + (2 + turns(D) + D) * s.nv;
   }
   Machine(const Plan<N, D>& scene, Numbers<V>& numbers, Arena<V>& arena)
       : plan(scene), own(numbers), newton(plan, arena), sight(plan, arena), scheme(plan, arena), whole(1) {
@@ -40,7 +40,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     newton.balance.recall(before.behind);
     sight.there.carriers = newton.balance.now.carriers;
     guess = arena.take(plan.nq), from = arena.take(plan.nq), found = arena.take(plan.nq), velocity = arena.take(plan.nv);
-    coarse = arena.take(plan.nq), axes = arena.take((turns(D) + D) * plan.nv);
+    coarse = arena.take(plan.nq), coarse_speed = arena.take(plan.nv), axes = arena.take((turns(D) + D) * plan.nv);
   }
 
   // All steps of worlds first … last − 1. Those that remain unsolved go on from the best that was found.
@@ -48,14 +48,13 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = eased = anew = M(false);
+    newton.running = eased = anew = leapt = struck = M(false), stiffest = estimate = V(0);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     if (paced()) set_base(fresh);
     while (any_aboard()) {
       set_out(fresh);
-      do newton.pass();
-      while (!enough());
+      while (!enough()) newton.pass();
       fresh = arrive();
     }
   }
@@ -74,6 +73,10 @@ template <class V, class N, int D, class Scheme> struct Machine {
   bool plainly[W];  // it is posed the step itself
   M eased;          // it is posed an easier step
   M anew;           // it is posed another step than before
+  V stiffest;       // Δt² (∂r/∂q)/m in it
+  V estimate;       // how far the end of its explicit step is off
+  M leapt;          // it has made one
+  M struck;         // something has pushed in its step of a frame
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
@@ -120,7 +123,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     const T dt = lane(whole, i) / T(1 << halvings);
     put(b.dt, i, dt), put(b.share, i, T(scheme.share(trips[i].eased))), put(eased, i, trips[i].eased > 0);
     if (Scheme::fits)
-      fit(plan, i, dt, b.fitted);
+      put(stiffest, i, fit(plan, i, dt, b.fitted));
     else
       for (int j = 0; j < plan.nv; j++) put(b.fitted[j], i, T(1));
     put(b.relaxed.width, i, T(problem.width)), put(b.relaxed.firmness, i, T(problem.firmness));
@@ -171,6 +174,21 @@ template <class V, class N, int D, class Scheme> struct Machine {
     b.relaxed.lagging = any(b.relaxed.lagged);
     if (b.relaxed.lagging) hold(fresh & b.relaxed.lagged);
     newton.begin(fresh, from, safe & fits);
+    if constexpr (Scheme::leaps)
+      if (rules.trust > 0) leap(fresh & fits);
+  }
+
+  // Lanes that set out on a step end where the explicit one leads, if they may.
+  void leap(M fresh) {
+    M first(false);
+    for (int i = 0; i < W; i++) put(first, i, lane(fresh, i) && trips[i].first() && ways[i].way == DIRECTLY);
+    leapt = leapt & !fresh;
+    if (!any(first)) return;
+    const M made = first & scheme.leap.make(newton.balance, sight, before.q, velocity, stiffest, T(rules.trust));
+    for (int i = 0; i < W; i++)
+      if (lane(first, i)) trips[i].evaluations += STAGES;
+    leapt = leapt | made, estimate = select(first, select(made, scheme.leap.error, V(0)), estimate);
+    newton.rest(made, scheme.leap.q);
   }
 
   // Inertia as in a step that has gone on for a share of its time only.
@@ -234,7 +252,10 @@ template <class V, class N, int D, class Scheme> struct Machine {
   M conclude(M over) {
     Balance<V, N, D>& b = newton.balance;
     if (!newton.settled) b.evaluate(newton.trial);  // running lanes look again; the others are where their attempt has ended
-    const M refused = scheme.advance(b, newton.q, before, after, eased);
+    M refused(false);
+    if (any(over & !leapt)) refused = scheme.advance(b, newton.q, before, after, eased) & !leapt;
+    if constexpr (Scheme::leaps)
+      if (any(over & leapt)) scheme.land(leapt, b.dt, before, after);
     for (int i = 0; i < plan.nq; i++) after.q[i] = newton.q[i];
     if (plan.remembered() > 0) b.remember(after.behind);
     M kept(false), solved(false), failed(false), part(false), lost(false);
@@ -297,19 +318,25 @@ template <class V, class N, int D, class Scheme> struct Machine {
 
   // Lanes whose step is part of a frame go on with the next half or step, and set out now; whose frame has ended.
   M pace(M ends, M& fresh) {
-    M whole_step(false), half(false), judged(false), taken(false), again(false), over(false);
+    M whole_step(false), half(false), judged(false), at_once(false), taken(false), again(false), over(false);
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i)) continue;
       frames[i].add(trips[i]);
       const Half made = frames[i].half;
-      put(whole_step, i, made == WHOLE), put(half, i, made == FIRST_HALF), put(judged, i, made == SECOND_HALF);
+      put(whole_step, i, made == WHOLE), put(half, i, made == FIRST_HALF);
+      put(judged, i, made == SECOND_HALF || made == AT_ONCE), put(at_once, i, made == AT_ONCE);
     }
     for (int i = 0; i < plan.nq; i++) coarse[i] = select(whole_step, after.q[i], coarse[i]);
+    if constexpr (Scheme::extrapolates) {
+      struck = (struck & !whole_step) | (ends & scheme.pushed(after));
+      for (int i = 0; i < plan.nv; i++) coarse_speed[i] = select(whole_step, scheme.speed(after, i), coarse_speed[i]);
+    }
     copy(plan, half, after, middle), copy(plan, half, after, before);
     V off(0);
     if (any(judged)) {
       place(plan, coarse, reached[0], axes), place(plan, after.q, reached[1], axes);
-      off = apart(plan, reached[0], reached[1]);
+      off = select(at_once, estimate, apart(plan, reached[0], reached[1]));
+      if constexpr (Scheme::extrapolates) scheme.extrapolate(judged & !at_once & !struck, coarse, coarse_speed, after);
     }
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i)) continue;
@@ -324,7 +351,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
         frame.half = Half(frame.half + 1);
       embark(i, frame.next());
     }
-    copy(plan, taken, after, base), copy(plan, taken, middle, last);
+    copy(plan, taken, after, base), copy(plan, taken & !at_once, middle, last), copy(plan, taken & at_once, before, last);
     copy(plan, again, base, before), copy(plan, over, base, after);
     if (any(again)) scheme.resize(again, spacing(), whole, before);
     if (any(over)) scheme.resize(over, spacing(), lengths(), after);
@@ -375,9 +402,10 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void report(int i) const {
     journey->report(at(i), paced() ? static_cast<const Tally<T>&>(frames[i]) : trips[i]);
     if (paced()) journey->frames.note(at(i), frames[i].pace, frames[i].spacing, frames[i].made);
+    if (journey->estimate) journey->estimate[at(i)] = lane(leapt, i) ? lane(estimate, i) : T(0);
     if (!journey->ways.ends) return;
     journey->ways.halved[at(i)] = trips[i].halvings;
-    if (trips[i].whole()) note(i, 0, trips[i].kept, after.q);
+    if (trips[i].whole()) note(i, 0, trips[i].status == EXPLICIT ? EXPLICIT : trips[i].kept, after.q);
   }
   // How a part of a step was made, and where it has ended.
   void note(int i, int part, int eased, const V* q) const {

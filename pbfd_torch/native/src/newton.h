@@ -15,7 +15,7 @@ constexpr double MAX_TURN = 1.0;       // [rad] of a joint in one step of Newton
 constexpr double ABSURD = 1e6;         // what drives the bodies may move them by so many times their extent in a step, or [rad]
 
 // As solvers/objective.py: up to HALVED the step is solved.
-enum Status { SOLVED, WARM_STARTED, CONTINUED, EASED, HALVED, STALLED, ITERATION_LIMIT, NON_FINITE };
+enum Status { EXPLICIT = -1, SOLVED, WARM_STARTED, CONTINUED, EASED, HALVED, STALLED, ITERATION_LIMIT, NON_FINITE };
 
 template <class V, class N, int D = 3> struct Newton {
   using T = typename Kind<V>::Scalar;
@@ -66,6 +66,14 @@ template <class V, class N, int D = 3> struct Newton {
     evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
     error = select(which, V(0), error), status = select(which, V(ITERATION_LIMIT), status);
     high = select(which, infinite<V>(), high);
+  }
+
+  // Lanes have ended at `there` without looking for it.
+  void rest(M which, const V* there) {
+    for (int i = 0; i < plan.nq; i++) q[i] = select(which, there[i], q[i]), trial[i] = select(which, there[i], trial[i]);
+    evaluations = select(which, V(0), evaluations), iterations = select(which, V(0), iterations);
+    error = select(which, V(0), error), status = select(which, V(EXPLICIT), status);
+    running = running & !which, settled = settled & !any(which);
   }
 
   // One evaluation of every lane that runs, and what it does next.

@@ -10,6 +10,7 @@ struct Rules {
   double surplus, share, jump;  // see `EnergyMomentum`, `Variational`, `Bdf2`
   int halvings, evaluations;    // how often a step may be halved; at most, with all that is tried
   double accuracy, shortest;    // of steps that each world chooses the length of, see frames.h; 0: their length is given
+  double trust;                 // of explicit steps, see `RungeKutta`; 0: there are none
 };
 
 template <class State> inline int room_for(Sizes s) {
