@@ -10,6 +10,7 @@ from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import State
+from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
@@ -44,6 +45,7 @@ __all__ = [
     "NotModelledWarning",
     "PbfdError",
     "Rollout",
+    "RungeKutta",
     "Scene",
     "Simulator",
     "Solution",

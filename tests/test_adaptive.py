@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from pbfd_torch import ImplicitEuler, InputError, Simulator, Status
+from pbfd_torch.balance.dynamics import apart
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models import SCENES
 from pbfd_torch.models.setup import Setup
 from pbfd_torch.records.rollout import Rollout
-from pbfd_torch.balance.dynamics import apart
 from pbfd_torch.simulator import AdaptiveSimulator
 from pbfd_torch.tree.kinematics import retract
 

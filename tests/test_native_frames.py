@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from pbfd_torch import Bdf2, EnergyMomentum, ImplicitEuler, Simulator, Variational
+from pbfd_torch import Bdf2, EnergyMomentum, ImplicitEuler, RungeKutta, Simulator, Variational
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Native, Torch
@@ -17,7 +17,7 @@ from pbfd_torch.simulator import AdaptiveSimulator
 from pbfd_torch.tensors.worlds import Worlds
 
 FRAME, ACCURACY = 0.05, 1e-4
-INTEGRATORS: tuple[Integrator[Any], ...] = (EnergyMomentum(), ImplicitEuler(), Variational(), Bdf2())
+INTEGRATORS: tuple[Integrator[Any], ...] = (EnergyMomentum(), ImplicitEuler(), Variational(), Bdf2(), RungeKutta())
 
 
 @pytest.mark.parametrize(

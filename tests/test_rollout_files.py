@@ -164,7 +164,7 @@ ARRAYS_CHANGED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "force NaN": (put("contact_force", (4, 1, 0, 2), math.nan), "contact_force holds nan in step 4 of world 1: must be finite"),
     "time NaN": (put("time", (2,), math.nan), "time holds nan in step 1: must be later than the step before"),
     "time back": (put("time", (2,), 0.0), "time holds 0 in step 1: must be later than the step before"),
-    "status unknown": (put("status", (1, 0), 99), "status holds 99 in step 1 of world 0: must be from 0 to 7"),
+    "status unknown": (put("status", (1, 0), 99), "status holds 99 in step 1 of world 0: must be from -1 to 7"),
     "iterations < 0": (put("iterations", (0, 1), -1), "iterations holds -1 in step 0 of world 1: must be ≥ 0"),
     "suspect": (put("suspect", (0, 1), 50), "suspect holds 50 in step 0 of world 1: must be from -1 to"),
     "lanes < 0": (put("lanes", (), -5), "lanes holds -5: must be ≥ 0"),

@@ -99,7 +99,7 @@ def apart(articulation: Articulation, first: Tensor, second: Tensor) -> Tensor:
     t = articulation.topology
     moved = (place(articulation, first).poses - place(articulation, second).poses)[..., :3, :]
     square = ((moved @ articulation.pseudo_inertia) * moved).sum((-2, -1))
-    body = torch.tensor(t.link_node, device=first.device)
+    body = t.link_node_index
     square, mass = (x.new_zeros(*x.shape[:-1], t.njoint + 1).index_add(-1, body, x) for x in (square, articulation.mass))
     heavy = mass > 0
     return torch.where(heavy, square / torch.where(heavy, mass, torch.ones_like(mass)), 0.0).amax(-1).clamp_min(0).sqrt()

@@ -25,7 +25,6 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.fitted import Fitted, stiffness
 from pbfd_torch.integrators.integrator import Leap, after
 from pbfd_torch.solvers.linear import solved_positive
-from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_springs import Armature
@@ -45,6 +44,7 @@ STAGES = (
 # what the solution of fourth order is short of
 SHORT = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 STIFFEST = 1.0  # Δt² (∂r/∂q)/m of springs, damping and actuators: beyond, they are left to the other scheme
+Pair = tuple[Tensor, Tensor]
 ROUNDING = 100.0  # of the size of the articulation, in units in the last place: no error is estimated to less
 
 
@@ -101,10 +101,10 @@ class RungeKutta(EnergyMomentum):
         return Leap(end, kept, error, 1 + len(STAGES))
 
 
-def _moved(start: tuple[Tensor, Tensor], h: Tensor, row: Sequence[float], rates: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def _moved(start: Pair, h: Tensor, row: Sequence[float], rates: Sequence[Pair]) -> Pair:
     """q and v moved by h Σ a k, without scaling quaternions."""
-    found = tuple(x + h * sum(a * k for a, k in zip(row, ks, strict=False) if a) for x, ks in zip(start, zip(*rates), strict=True))
-    return found[0], found[1]
+    used = [(a, *rate) for a, rate in zip(row, rates, strict=False) if a]
+    return start[0] + h * sum(a * k for a, k, _ in used), start[1] + h * sum(a * k for a, _, k in used)
 
 
 class _Flow:
@@ -112,7 +112,6 @@ class _Flow:
 
     def __init__(self, terms: Sequence[Term], objective: BalanceObjective) -> None:
         self._objective, self._terms = objective, terms
-        self._flowing = [term for term in terms if isinstance(term, Flowing)]
         step, a = objective.step, objective.articulation
         smooth = torch.ones_like(step.target_q[..., 0], dtype=torch.bool)
         for term in terms:
@@ -145,10 +144,9 @@ class _Flow:
 
     def _force(self, now: Placement, v: Tensor, fitted: bool = False) -> Tensor:
         """Generalised, `[*batch, nv]`; fitted: of what has its share of a step alone."""
-        kinds = self._flowing
-        if fitted:
-            kinds = [term for term, used in zip(self._terms, self._objective.terms, strict=True) if isinstance(used, Fitted)]
-        loads = [term.flow(now, v, self._objective.step.control) for term in kinds if isinstance(term, Flowing)]
+        used = [isinstance(term, Fitted) or not fitted for term in self._objective.terms]
+        flowing = [term for term, wanted in zip(self._terms, used, strict=True) if wanted and isinstance(term, Flowing)]
+        loads = [term.flow(now, v, self._objective.step.control) for term in flowing]
         return -Balance(now, loads).residual if loads else torch.zeros_like(v)
 
 

@@ -52,7 +52,7 @@ def require_fitting(arrays: Mapping[str, Tensor], links: int) -> None:
 def require_plausible(arrays: Mapping[str, Tensor], dangers: int) -> None:
     """Raises `InputError` naming the first array of fitting ones with a value that no simulation leaves, with its step and world;
     `dangers`: how many there are."""
-    ranges = dict.fromkeys(COUNTS, (0, None)) | {"status": (0, int(max(Status))), "suspect": (-1, dangers - 1)}
+    ranges = dict.fromkeys(COUNTS, (0, None)) | {"status": (int(min(Status)), int(max(Status))), "suspect": (-1, dangers - 1)}
     for name, (low, high) in sorted(ranges.items()):
         value = arrays[name].long()
         wrong = value < low if high is None else (value < low) | (value > high)

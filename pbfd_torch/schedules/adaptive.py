@@ -1,9 +1,9 @@
 """Steps of their own for every world: a user asks for an accuracy, and each world finds the Δt that gives it.
 
 Every step is made twice, whole and as two halves; how far both end apart is the error estimate. What both say together is kept,
-which is of fourth order, or the halves where something has pushed. Explicit steps (`RungeKutta`) know their error without halves. A
-world goes on with the step that its own error asks for and never waits for another one but at the ends of the frames, where its control
-changes and its state is recorded.
+which is of fourth order, or the halves where something has pushed. Explicit steps (`RungeKutta`) know their error without halves.
+A world goes on with the step that its own error asks for and never waits for another one but at the ends of the frames, where its
+control changes and its state is recorded.
 """
 
 from __future__ import annotations

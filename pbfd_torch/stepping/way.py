@@ -116,7 +116,7 @@ def _flat(way: Way) -> Way:
     detours = tuple(
         replaced(d, worlds=Worlds((_count(way),), d.worlds.index), legs=tuple(_flat(x) for x in d.legs)) for d in way.detours
     )
-    return Way(way.q.reshape(-1, way.q.shape[-1]), detours)
+    return Way(way.q.reshape(-1, way.q.shape[-1]), detours, explicit=way.explicit)
 
 
 def _count(way: Way) -> int:
