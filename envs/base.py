@@ -22,9 +22,10 @@ from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, State
 from pbfd_torch.models.setup import Setup
-from pbfd_torch.simulator import Simulator
+from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.per_world import chosen
 from pbfd_torch.stepping.stepper import SHORTEST_STEP
+from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.actuators import Actuators
 
 DRAWN = ("world_factors", "world_push")  # what worlds differ by; no integrator's state has fields of these names
@@ -80,6 +81,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         num_envs: worlds ≥ 1. device, dtype (float64 or float32): of the simulation.
         seed: of resets and randomisation; None: 0.
         control_dt: [s] between actions; None: the task's. dt: [s] step of the simulation, a whole fraction of it; None: the same.
+        accuracy: [m] > 0, instead of `dt`: each world chooses its own steps for it, see `AdaptiveSimulator`; they carry no derivatives.
         integrator: None: implicit Euler, the paper's: at control steps of 8 ms of robots that stand on the ground it is about as
             accurate as the others and cheaper.
         max_episode_steps: after which an episode is truncated; None: the task's.
@@ -107,6 +109,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         integrator: Integrator[Any] | None = None,
         max_episode_steps: int | None = None,
         randomization: Randomization | None = None,
+        accuracy: float | None = None,
     ) -> None:
         memory.require_room("num_envs", num_envs)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
@@ -125,7 +128,8 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.setup = self.make_setup(dtype, torch.device(device))
         self.scene = self.setup.scene
         # a world that is hard to solve ends sooner than others wait for it
-        self.simulator: Simulator[Any] = Simulator(self.scene, self.dt, integrator or ImplicitEuler(), halvings=HALVINGS)
+        self.accuracy = accuracy
+        self.simulator = self._simulator(integrator)
         self._worlds = None if randomization is None else DrawnWorlds(self.simulator, randomization)
         (bank,) = (term for term in self.scene.terms if isinstance(term, Actuators))
         self.low, self.high = bank.control_range.unbind(-1)
@@ -137,6 +141,13 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self._like: State = self._state_like
         self._make_specs(start)
         self._set_seed(self._seed)  # the probe has drawn numbers
+
+    def _simulator(self, integrator: Integrator[Any] | None) -> Simulator[Any]:
+        if self.accuracy is None:
+            return Simulator(self.scene, self.dt, integrator or ImplicitEuler(), halvings=HALVINGS)
+        if self.substeps > 1:
+            raise InputError(f"dt is {self.dt} s and accuracy {self.accuracy} m: only one of them may be given")
+        return AdaptiveSimulator(self.scene, self.control_dt, self.accuracy, integrator)
 
     # what a task says ------------------------------------------------------------------------------------------------
 
@@ -326,6 +337,8 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         flat = {"steps": torch.zeros((len(q), 1), dtype=torch.int64, device=q.device), "start_v": v.clone()}
         with torch.no_grad():
             state = self._of(drawn).initial_state(q, v)
+            if self.accuracy is not None:  # a state has it after its first step, and is to be of one kind always
+                state = replaced(state, pace=torch.full_like(state.time, self.control_dt))
         self._state_like = state
         return packed(state) | flat | (drawn or {})
 

@@ -270,7 +270,7 @@ def test_rows_of_the_quick_run(ran: Ran) -> None:
     assert report["environment"]["mujoco"] == mujoco.__version__
     for scene in report["scenes"].values():
         rows = {(r["simulator"], r["integrator"], r["dt"]): r for r in scene["rows"]}
-        assert len(rows) == len(scene["rows"]) == 2 + 3 * 3
+        assert len(rows) == len(scene["rows"]) == 2 + 3 * 4
         for dt in (0.05, 0.1):
             ours = rows["pbfd_torch", "implicit-euler", dt]
             assert ours["error"] > 0

@@ -56,6 +56,26 @@ def test_specs(name: str, dtype: torch.dtype) -> None:
     assert start.batch_size == torch.Size([2])
 
 
+def test_accuracy_instead_of_a_step() -> None:
+    """Worlds choose their own steps: nearer to fine steps than the control step is, of the same kind of state from the start on."""
+    env = HopperEnv(num_envs=3, accuracy=1e-5, control_dt=0.02, seed=1)
+    check_env_specs(env)
+    held, ends = actions(env, 10, size=0.3), []
+    start = HopperEnv(num_envs=3, control_dt=0.02, seed=1).reset()["state", "q"]
+    v = torch.zeros(3, 6, dtype=torch.float64)
+    choices: tuple[dict[str, Any], ...] = ({"accuracy": 1e-5}, {"dt": 0.02}, {"dt": 0.02 / 128})
+    for choice in choices:
+        env = HopperEnv(num_envs=3, control_dt=0.02, integrator=EnergyMomentum(), seed=1, **choice)
+        ends.append(played(env, held, env.set_state(start, v))["next", "state", "q"][:, -1])
+    ours, coarse, fine = ends
+    assert float((ours - fine).abs().max()) < 0.5 * float((coarse - fine).abs().max())
+
+
+def test_accuracy_or_a_step() -> None:
+    with pytest.raises(InputError, match=r"^dt is 0.004 s and accuracy 0.0001 m: only one of them may be given$"):
+        HopperEnv(accuracy=1e-4, dt=0.004)
+
+
 def test_importing_the_library_does_not_import_torchrl() -> None:
     code = "import sys, pbfd_torch; assert not {'torchrl', 'tensordict', 'gymnasium'} & set(sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0

@@ -15,7 +15,7 @@ from torch import Tensor
 from pbfd_torch.bench.mujoco_scenes import ROBOTS, mjcf
 from pbfd_torch.bench.timing import timed
 
-INTEGRATORS = ("Euler", "implicitfast", "RK4")
+INTEGRATORS = ("Euler", "implicitfast", "discrete", "RK4")
 ENGINE = "mujoco"  # beside our own engines' names
 _DIVERGED = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_INERTIA")
 

@@ -25,11 +25,13 @@ from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.native.engine import Engine
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import AdaptiveSimulator, Simulator
 from pbfd_torch.solvers.objective import FALLBACKS
 
-OURS, PEER, ADAPTIVE = "pbfd_torch", "MuJoCo", "adaptive"
-OWN, OWN_PEER = "energy-momentum", "RK4"  # the integrators that are references, each of its own simulator
+OURS, PEER = "pbfd_torch", "MuJoCo"
+ADAPTIVE = {"energy-momentum": "adaptive", "runge-kutta": "adaptive runge-kutta"}  # what rows are called
+OWN, OWN_PEER = "runge-kutta", "RK4"  # the integrators that are references, each of its own simulator
 MOST_CALLS = 100  # of the core, to take the shortest
 SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
 NOTES = (
@@ -39,8 +41,8 @@ NOTES = (
         "motion, spread evenly over it; a single world is timed from several such times (box: μ = .1)"
     ),
     (
-        "adaptive: energy–momentum steps of every world's own choice for an accuracy, Δt: their mean; time: of the whole recorded "
-        "motion (box: all μ at once)"
+        "adaptive: steps of every world's own choice for an accuracy, of energy–momentum or Runge–Kutta, in frames of .1 s; Δt: their "
+        "mean"
     ),
     "time of MuJoCo: the whole motion in C, the shortest of up to 3 runs; it has no batch: one world's time stands for any number",
     (
@@ -80,20 +82,20 @@ class Effort:
     pieces: int = 8
     repeats: int = 3
     scenes: tuple[str, ...] = tuple(CASES)
-    accuracies: tuple[float, ...] = (1e-2, 1e-3, 1e-4, 1e-5)
+    accuracies: tuple[float, ...] = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 
     def steps_of(self, case: Case) -> tuple[float, ...]:
         """Ours for this scene [s]."""
         return tuple(dt for dt in self.steps if dt >= case.smallest_step)
 
-    def accuracies_with(self, integrators: Sequence[str]) -> tuple[float, ...]:
-        """Those of the adaptive runs, which are the default integrator's, beside these [m]."""
-        return self.accuracies if OWN in integrators else ()
+    def adaptive(self, integrators: Sequence[str]) -> list[tuple[str, float]]:
+        """The adaptive runs of these integrators, each with its accuracy [m]."""
+        return [(name, accuracy) for name in integrators if name in ADAPTIVE for accuracy in self.accuracies]
 
     def units(self, case: Case, integrators: Sequence[str], peers: Sequence[str]) -> int:
         """How often `measure_scene` tells its progress."""
         ours = 2 * len(integrators) * len(self.steps_of(case))
-        return ours + len(peers) * len(self.peer_steps) + len(self.accuracies_with(integrators))
+        return ours + len(peers) * len(self.peer_steps) + len(self.adaptive(integrators))
 
 
 FULL = Effort()
@@ -161,23 +163,29 @@ def starts(track: Track, worlds: int, first: int, count: int) -> tuple[Tensor, T
     return track.q[row, copy], track.v[row, copy], track.time[row]
 
 
-def our_cost(case: Case, motion: Motion, worlds: int, seconds: float, pieces: int, engine: Engine | None = None) -> float:
-    """Wall time per simulated second and world [ms]."""
+def our_cost(case: Case, track: Track, make: Callable[[Scene], Simulator[Any]], worlds: int, seconds: float, pieces: int) -> float:
+    """Wall time per simulated second and world [ms] of what steps a scene, over pieces of a motion of its own."""
     setup = case.setup(worlds)
-    simulator = Simulator(setup.scene, motion.dt, integrator=INTEGRATORS[motion.integrator](), engine=engine)
-    groups = pieces if worlds == 1 else 1
-    span = max(2, motion.rollout.steps // pieces)
+    simulator = make(setup.scene)
+    dt, groups = simulator.dt, pieces if worlds == 1 else 1
+    span = max(2, (len(track.time) - 1) // pieces)
     each = []
     for group in range(groups):
-        q, v, begin = starts(motion.track, worlds, group, groups)
-        controls = [case.controls(motion.dt, begin + motion.dt * k) for k in range(span + 1)]
+        q, v, begin = starts(track, worlds, group, groups)
+        controls = [case.controls(dt, begin + dt * k) for k in range(span + 1)]
         fresh, began = simulator.initial_state(q, v, controls[0]), time.perf_counter()
         # the first step does not count: a velocity that is an average over the last one makes it harder than others
         start, _ = simulator.step(fresh, controls[0])
         first = time.perf_counter() - began
         slow = first > SLOW * seconds / groups
         each.append(first if slow else _step_time(simulator, start, controls[1:], seconds / groups))
-    return 1e3 * sum(each) / groups / motion.dt / worlds
+    return 1e3 * sum(each) / groups / dt / worlds
+
+
+def _costs(case: Case, track: Track, make: Callable[[Scene], Simulator[Any]], effort: Effort) -> dict[str, float]:
+    """The same of one world and of a batch, by their number."""
+    batches = zip((1, effort.worlds), effort.seconds, strict=True)
+    return {str(worlds): our_cost(case, track, make, worlds, seconds, effort.pieces) for worlds, seconds in batches}
 
 
 def _step_time(simulator: Simulator[Any], start: Any, controls: Sequence[Tensor | None], seconds: float) -> float:
@@ -221,39 +229,42 @@ def our_row(
     """One time step of one integrator as plain data; other: MuJoCo's reference, where it has its own."""
     rollout = motion.rollout
     away = {} if other is None or case.exact is not None else {"error_to_mujoco": case.error(motion.track, other.value)}
-    batches = zip((1, effort.worlds), effort.seconds, strict=True)
+    scheme = INTEGRATORS[motion.integrator]
     return {
         **_ours(case, motion.track, rollout, reference),
         "engine": motion.engine,
         "integrator": motion.integrator,
         "dt": motion.dt,
         "world_steps": rollout.status.numel(),
-        "ms_per_s": {str(worlds): our_cost(case, motion, worlds, seconds, effort.pieces, engine) for worlds, seconds in batches},
+        "ms_per_s": _costs(case, motion.track, lambda scene: Simulator(scene, motion.dt, scheme(), engine=engine), effort),
         **_told(case, motion.track),
         **away,
     }
 
 
-def adaptive_row(case: Case, accuracy: float, reference: Reference, engine: Engine | None = None) -> dict[str, Any]:
+def adaptive_row(
+    case: Case, integrator: str, accuracy: float, reference: Reference, effort: Effort, engine: Engine | None = None
+) -> dict[str, Any]:
     """One run with steps of the worlds' own."""
     setup = case.setup(case.tracked_worlds)
-    simulator: AdaptiveSimulator[State] = AdaptiveSimulator(setup.scene, FRAME, accuracy, engine=engine)
-    frames = step_count(case.duration, FRAME)
+
+    def made(scene: Scene) -> Simulator[State]:
+        return AdaptiveSimulator(scene, FRAME, accuracy, INTEGRATORS[integrator](), engine=engine)
+
+    simulator, frames = made(setup.scene), step_count(case.duration, FRAME)
     controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
-    began = time.perf_counter()
     rollout = simulator.rollout(start, controls, frames if controls is None else None)
-    wall = time.perf_counter() - began
     track = Track.of_rollout(setup, rollout)
     steps = int(rollout.substeps.sum())
     return {
         **_ours(case, track, rollout, reference),
         "engine": simulator.engine,
-        "integrator": ADAPTIVE,
+        "integrator": ADAPTIVE[integrator],
         "dt": case.duration * setup.worlds / steps,
         "accuracy_m": accuracy,
         "world_steps": steps,
-        "ms_per_s": {"1": 1e3 * wall / case.duration / setup.worlds},
+        "ms_per_s": _costs(case, track, made, effort),
         **_told(case, track),
     }
 
@@ -307,8 +318,8 @@ def measure_scene(
     for motion in motions:
         rows.append(our_row(case, motion, reference, other, effort, engine))
         progress(1)
-    for accuracy in effort.accuracies_with(integrators):
-        rows.append(adaptive_row(case, accuracy, reference, engine))
+    for name, accuracy in effort.adaptive(integrators):
+        rows.append(adaptive_row(case, name, accuracy, reference, effort, engine))
         progress(1)
     if other is not None:
         for name in peers:

@@ -21,10 +21,14 @@ from pbfd_torch.files import write_figure
 
 FLOOR = 1e-12  # smaller errors are drawn here
 COLORS = ("#000000", "#e8a400", "#2ca02c", "#d62728", "#8c564b", "#17becf")  # ours
-ADAPTIVE_STYLE: Mapping[str, Any] = {"color": "#c000c0", "marker": "*"}
+ADAPTIVE_STYLES: Mapping[str, Mapping[str, Any]] = {
+    ADAPTIVE["energy-momentum"]: {"color": "#c000c0", "marker": "*"},
+    ADAPTIVE["runge-kutta"]: {"color": "#8c564b", "marker": "*"},
+}
 PEER_STYLES: Mapping[str, dict[str, Any]] = {
     "Euler": {"color": "0.65", "marker": "s"},
     "implicitfast": {"color": "0.4", "marker": "^"},
+    "discrete": {"color": "#17becf", "marker": "v"},
     "RK4": {"color": "#1f77b4", "marker": "D"},
 }
 
@@ -38,8 +42,7 @@ def draw_work(report: Mapping[str, Any], path: Path) -> None:
             if name[0] == PEER:
                 _curve(axes, rows, lambda row: row["ms_per_s"]["1"], style)
                 continue
-            if name[1] != ADAPTIVE:
-                _curve(axes, rows, lambda row: row["ms_per_s"][batch], style)
+            _curve(axes, rows, lambda row: row["ms_per_s"][batch], style)
             _curve(axes, rows, lambda row: row["ms_per_s"]["1"], style | {"alpha": 0.35, "linestyle": "--"})
         axes.set_xlabel("wall ms per simulated s and world")
 
@@ -81,8 +84,8 @@ def _curves(scene: Mapping[str, Any], integrators: list[str]) -> Curves:
 def _style(simulator: str, integrator: str, integrators: list[str]) -> dict[str, Any]:
     if simulator == PEER:
         return dict(PEER_STYLES[integrator])
-    if integrator == ADAPTIVE:
-        return dict(ADAPTIVE_STYLE)
+    if integrator in ADAPTIVE_STYLES:
+        return dict(ADAPTIVE_STYLES[integrator])
     return {"color": COLORS[integrators.index(integrator) % len(COLORS)], "marker": "o"}
 
 

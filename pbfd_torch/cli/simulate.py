@@ -68,6 +68,7 @@ class Result:
             "ms_per_simulated_s_per_world": 1e3 * self.wall_s / duration / self.setup.worlds,
             "solved_fraction": float(r.solved.to(torch.float64).mean()),
             "unsolved_steps": int((~r.solved).sum()),
+            "explicit_steps": int((r.status == int(Status.EXPLICIT)).sum()),
             "warm_started_steps": int((r.status == int(Status.WARM_STARTED)).sum()),
             "continued_steps": int((r.status == int(Status.CONTINUED)).sum()),
             "eased_steps": int((r.status == int(Status.EASED)).sum()),
