@@ -21,6 +21,8 @@ ALL = tuple(INTEGRATORS)
 FIRST_ORDER = ("implicit-euler",)
 SECOND_ORDER = tuple(name for name in ALL if name not in FIRST_ORDER)
 CONSERVING = ("variational", "energy-momentum")  # the angular momentum, exactly
+HIGH_ORDER = ("runge-kutta",)
+EXACT = tuple(name for name in ALL if name not in HIGH_ORDER)  # linear momentum of what flies: not just to an order
 ONE_STEP = tuple(name for name in ALL if name != "bdf2")  # no memory of contact forces before the last step's
 MEAN_VELOCITY = ("implicit-euler", "variational")  # their velocity is the average over the last step
 BEST = ("energy-momentum",)

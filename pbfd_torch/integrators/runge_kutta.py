@@ -53,7 +53,7 @@ class RungeKutta(EnergyMomentum):
     """`trust`: > 0, the error estimate, as a share of what the bodies move by in the step, up to which an explicit step is taken.
     Raises `InputError` for others. `surplus`: of the other steps, see `EnergyMomentum`."""
 
-    trust: float = 1e-3
+    trust: float = 1e-4
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -2,6 +2,7 @@
 #pragma once
 #include "apart.h"
 #include "flow.h"
+#include "standstill.h"
 #include "strayed.h"
 
 namespace pbfd {
@@ -54,6 +55,7 @@ template <class V, class N, int D = 3> struct Leap {
       flow.accelerate(sight.there, sight.axes, at, v, b.control, gains[s]);
     }
     for (int i = 0; i < plan.nq; i++) q[i] = at[i];
+    kept = kept & near(q, plan.nq) & finite(v, plan.nv);
     blend(q, h, SHORT, STAGES, moves, plan.nq, at);
     normalize(plan, at, at), place(plan, at, short_of, axes);
     error = apart(plan, short_of, sight.there);
@@ -65,7 +67,7 @@ template <class V, class N, int D = 3> struct Leap {
     const T epsilon = sizeof(T) == 8 ? T(DBL_EPSILON) : T(FLT_EPSILON);
     const V least = V(T(ROUNDED) * epsilon) * V(plan.reach[0]);
     kept = kept & (error <= fma(V(trust), apart(plan, b.start, sight.there), least));
-    for (int i = 0; i < plan.nv; i++) kept = kept & (abs(v[i]) < infinite<V>()), lag[i] = h * (V(1) - V(2) * b.fitted[i]) * flow.others[i];
+    for (int i = 0; i < plan.nv; i++) lag[i] = h * (V(1) - V(2) * b.fitted[i]) * flow.others[i];
     substitute(tree(plan), flow.momenta.matrix, lag);
     for (int i = 0; i < plan.nv; i++) v[i] = fma(V(-0.5), lag[i], v[i]);
     return kept;
