@@ -81,7 +81,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         num_envs: worlds ≥ 1. device, dtype (float64 or float32): of the simulation.
         seed: of resets and randomisation; None: 0.
         control_dt: [s] between actions; None: the task's. dt: [s] step of the simulation, a whole fraction of it; None: the same.
-        accuracy: [m] > 0, instead of `dt`: each world chooses its own steps for it, see `AdaptiveSimulator`; they carry no derivatives.
+        accuracy: [m] > 0, instead of `dt`: each world chooses its own steps for it, see `AdaptiveSimulator`; without derivatives.
         integrator: None: implicit Euler, the paper's: at control steps of 8 ms of robots that stand on the ground it is about as
             accurate as the others and cheaper.
         max_episode_steps: after which an episode is truncated; None: the task's.

@@ -151,6 +151,7 @@ class Solution:
     evaluations: `[*batch]` int, evaluations of the residual spent.
     fallbacks: `[*batch, 4]` int, how often each of `FALLBACKS` was tried.
     estimate: `[*batch]` [m], how far the end is off in worlds whose step was explicit, else 0; None: in none.
+    strike: `[*batch]` the share of an explicit step after which something would have struck, so that another one was made; else 1.
     steps: `[*batch]` int, steps of a world that chooses their length itself; None: one for all.
     lanes: evaluations that the schedule spent on all worlds together, those on finished worlds included.
     """
@@ -162,6 +163,7 @@ class Solution:
     evaluations: Tensor
     fallbacks: Tensor
     estimate: Tensor | None = None
+    strike: Tensor | None = None
     steps: Tensor | None = None
     lanes: int = 0
 

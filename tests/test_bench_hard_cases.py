@@ -61,14 +61,14 @@ def test_a_failure_is_shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert call(monkeypatch, *arguments) == 1
     printed = " ".join(capsys.readouterr().out.split())
     assert "FAIL .1" in printed
-    assert "8 runs, 1 failed" in printed
+    assert "10 runs, 1 failed" in printed
     assert "hard-cases.md" in printed
     results = json.loads((tmp_path / "hard-cases.json").read_text())["results"]
     assert [x["checks"][0]["value"] for x in results if x["integrator"] == "implicit-euler"] == [None, None]
     assert call(monkeypatch, *arguments, "--integrators", "implicit-euler,variational") == 0
     assert "pass (.05 .1 over)" in capsys.readouterr().out
     assert call(monkeypatch, *arguments, "--quick") == 0
-    assert "4 runs, 0 failed" in capsys.readouterr().out
+    assert "5 runs, 0 failed" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pbfd_torch import Articulation, Joint, JointKind, Link, Scene, Simulator
 from pbfd_torch.balance.dynamics import apart
+from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
 from pbfd_torch.integrators.runge_kutta import SHORT, STAGES, RungeKutta
@@ -22,14 +23,16 @@ from pbfd_torch.simulator import AdaptiveSimulator
 from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.terms.actuators import Actuator, Actuators
+from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_limits import JointLimits
 from pbfd_torch.terms.joint_springs import Armature, JointDamping, JointSprings, PreparedPull
 from pbfd_torch.terms.load import JointLoad, StepContext, Term
+from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.pushes import Pushes
 from pbfd_torch.tree.kinematics import Placement, difference, retract
-from tests.bodies import down
+from tests.bodies import at, diagonal, down, free_body, on_ground
 from tests.random_trees import generator, random_q, random_tree
 
 EXPLICIT = int(Status.EXPLICIT)
@@ -152,18 +155,18 @@ def test_the_estimate_is_honest(engine: Torch | Native) -> None:
 
 @ENGINES
 @pytest.mark.parametrize(
-    ("scene", "velocity"),
+    ("scene", "velocity", "spent"),
     [
-        (on_hinge(JointDryFriction(doubles(0.1))), 1.0),
-        (on_hinge(JointDamping(doubles(150.0))), 1.0),
-        (on_hinge(JointSprings(doubles(2e4), doubles(0.0))), 1.0),
-        (on_hinge(JointLimits(doubles(1e5)), lower=-1e-4), -1.0),
-        (on_hinge(JointLimits(doubles(1e5)), lower=1e-4), 0.0),
+        (on_hinge(JointDryFriction(doubles(0.1))), 1.0, 0),
+        (on_hinge(JointDamping(doubles(150.0))), 1.0, 0),
+        (on_hinge(JointSprings(doubles(2e4), doubles(0.0))), 1.0, 0),
+        (on_hinge(JointLimits(doubles(1e5)), lower=-1e-4), -1.0, 7),
+        (on_hinge(JointLimits(doubles(1e5)), lower=1e-4), 0.0, 0),
     ],
     ids=["dry friction", "stiff damping", "stiff spring", "limit on the way", "limit at the start"],
 )
-def test_where_the_other_scheme_makes_the_step(engine: Torch | Native, scene: Scene, velocity: float) -> None:
-    """To the bit, and at the price of having tried."""
+def test_where_the_other_scheme_makes_the_step(engine: Torch | Native, scene: Scene, velocity: float, spent: int) -> None:
+    """To the bit, and at the price of having tried where that may have helped."""
     ours, other = (Simulator(scene, 0.01, scheme, engine=engine) for scheme in (RungeKutta(), EnergyMomentum()))
     state = other.initial_state(doubles(0.0), doubles(velocity))
     end, solution = ours.step(state)
@@ -172,7 +175,7 @@ def test_where_the_other_scheme_makes_the_step(engine: Torch | Native, scene: Sc
         if isinstance(value, Tensor):
             assert torch.equal(getattr(end, name), value), name
     assert torch.equal(solution.status, theirs.status)
-    assert int(solution.evaluations) == int(theirs.evaluations) + 7
+    assert int(solution.evaluations) == int(theirs.evaluations) + spent
     assert solution.estimate is not None
     assert float(solution.estimate) == 0.0
 
@@ -266,9 +269,81 @@ def tip_error(scheme: EnergyMomentum) -> Error:
 
 @pytest.mark.parametrize("scheme", [EnergyMomentum(), RungeKutta()], ids=lambda x: type(x).__name__)
 def test_accuracy_is_worth_what_it_costs(scheme: EnergyMomentum) -> None:
-    """Each tightening by a hundred reduces the error by thirty at least."""
+    """Each tightening by a hundred reduces the error; by thirty at least where all steps are of one kind."""
     error = tip_error(scheme)
     errors = [error(accuracy) for accuracy in (1e-4, 1e-6, 1e-8)]
     assert errors[0] < 2e-2
-    assert errors[1] < errors[0] / 30
+    assert errors[1] < errors[0] / (30 if type(scheme) is EnergyMomentum else 3)
     assert errors[2] < errors[1] / 30
+
+
+# Strikes -------------------------------------------------------------------------------------------------------------------------
+
+
+def dropped(height: float) -> tuple[Scene, Tensor, Tensor]:
+    """A full ball of 1 kg over the ground, at 1 m/s sideways."""
+    inertia = 0.4 * 0.05**2
+    scene = on_ground(free_body(1.0, diagonal(inertia, inertia, inertia)), Sphere(0.05), NormalForce(1e8), CoulombFriction(0.3))
+    return scene, at(0.05 + height), doubles(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("share", [0.03, 0.4, 0.97])
+def test_the_instant_of_a_strike(share: float) -> None:
+    """A ball that falls .5 m strikes after √(2 h/g): known to a billionth of the step, and not late."""
+    scene, q, v = dropped(0.5)
+    fall, dt = math.sqrt(2 * 0.5 / 9.81), 0.05
+    simulator = Simulator(scene, dt, RungeKutta(), engine=Torch())
+    begin = fall - share * dt
+    q[2] -= 0.5 * 9.81 * begin**2
+    v[2] = -9.81 * begin
+    _, solution = simulator.step(simulator.initial_state(q, v))
+    assert int(solution.status) != EXPLICIT
+    assert solution.strike is not None
+    assert share - 1e-8 <= float(solution.strike) <= share + 1e-12
+
+
+def test_nothing_strikes_what_passes() -> None:
+    scene, q, v = dropped(0.5)
+    simulator = Simulator(scene, 0.01, RungeKutta(), engine=Torch())
+    _, solution = simulator.step(simulator.initial_state(q, v))
+    assert solution.strike is not None
+    assert float(solution.strike) == 1.0
+
+
+def test_a_limit_strikes() -> None:
+    """A wheel at 2 rad/s, .03 rad away from its limit."""
+    scene = on_hinge(JointLimits(doubles(1e5)), lower=-0.03)
+    simulator = Simulator(scene, 0.02, RungeKutta(), engine=Torch())
+    _, solution = simulator.step(simulator.initial_state(doubles(0.0), doubles(-2.0)))
+    assert solution.strike is not None
+    assert float(solution.strike) == pytest.approx(0.75, abs=1e-8)
+
+
+@ENGINES
+def test_steps_of_a_frame_end_where_something_strikes(engine: Torch | Native) -> None:
+    """The ball flies to the ground in one explicit step and lies there after a few others; sideways it goes on as it rolls, as
+    friction stops the sliding of its lowest point within the impact."""
+    scene, q, v = dropped(0.2)
+    fall = math.sqrt(2 * 0.2 / 9.81)
+    simulator = AdaptiveSimulator(scene, 0.25, 1e-3, RungeKutta(), engine=engine)
+    rollout = simulator.rollout(simulator.initial_state(q, v), steps=4)
+    assert bool(rollout.solved.all())
+    assert int(rollout.substeps[0]) <= 8
+    assert float(rollout.q[-1, 2]) == pytest.approx(0.05, abs=1e-3)
+    rolling = 5 / 7  # of its speed
+    went = fall + rolling * (1.0 - fall)
+    assert float(rollout.q[-1, 0]) == pytest.approx(went, abs=5e-3)
+
+
+@ENGINES
+def test_a_body_that_bounces_and_rocks_goes_on(engine: Torch | Native) -> None:
+    """A box dropped on its edge strikes again and again, at last within too little time: plain steps then; it comes to lie."""
+    setup = SCENES["box-slide"](worlds=2)
+    q = setup.q.clone()
+    q[:, 2] += 0.15
+    q[:, 3:] = torch.nn.functional.normalize(doubles(1.0, 0.1, 0.25, 0.0), dim=0)
+    simulator = AdaptiveSimulator(setup.scene, 0.1, 1e-3, RungeKutta(), engine=engine)
+    rollout = simulator.rollout(simulator.initial_state(q, torch.zeros_like(setup.v)), steps=20)
+    assert bool(rollout.solved.all())
+    assert float(rollout.v[-1].abs().max()) < 1e-3
+    assert int(rollout.substeps.sum(0).max()) < 3000

@@ -124,8 +124,8 @@ def _tip_error(setup: Setup, rollout: Rollout) -> float:
 
 def chain_flight(run: Run) -> Sequence[Check]:
     """A straight chain turns at 10 rad/s and flies at 5 m/s, 2 s: Δp/p < 1e-10 at Δt .01 and .1, elsewhere < 4e-10, which is
-    what 1e-9 of the weight on every step may come to (explicit steps keep it to their order); at Δt ≤ .01 ΔL/L < 1e-8 and |ΔE|/E < 1e-3 with energy–momentum; E
-    never above E0 by more than .1 % at any Δt."""
+    what 1e-9 of the weight on every step may come to (explicit steps keep it to their order); at Δt ≤ .01 ΔL/L < 1e-8 and
+    |ΔE|/E < 1e-3 with energy–momentum; E never above E0 by more than .1 % at any Δt."""
     setup = chain_free()
     rollout = run.roll_setup(setup, run.seconds(2.0, 0.5))
     start = float(setup.scene.energy(setup.q, setup.v))

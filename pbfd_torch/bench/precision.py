@@ -41,8 +41,8 @@ NOTES = (
         "motion, spread evenly over it; a single world is timed from several such times (box: μ = .1)"
     ),
     (
-        "adaptive: steps of every world's own choice for an accuracy, of energy–momentum or Runge–Kutta, in frames of .1 s; Δt: their "
-        "mean"
+        "adaptive: steps of every world's own choice for an accuracy, of energy–momentum or Runge–Kutta, in frames of .1 s; "
+        "Δt: their mean"
     ),
     "time of MuJoCo: the whole motion in C, the shortest of up to 3 runs; it has no batch: one world's time stands for any number",
     (

@@ -141,13 +141,17 @@ class Leap(Generic[S]):
         end: the state after it.
         kept: `[*batch]` bool, which may go on from there.
         error: `[*batch]` [m], how far its end is off, as estimated; see `apart`.
-        evaluations: of what moves the bodies.
+        strike: `[*batch]` the share of the step after which something strikes, where nothing else keeps a world from making
+            it; else 1.
+        evaluations: `[*batch]` int, of what moves the bodies, in worlds that might have made it; stages: for each of these.
     """
 
     end: S
     kept: Tensor
     error: Tensor
-    evaluations: int
+    strike: Tensor
+    evaluations: Tensor
+    stages: int
 
 
 @runtime_checkable

@@ -45,6 +45,7 @@ STAGES = (
 SHORT = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 STIFFEST = 1.0  # Δt² (∂r/∂q)/m of springs, damping and actuators: beyond, they are left to the other scheme
 Pair = tuple[Tensor, Tensor]
+SCANS, BISECTIONS = 8, 30  # of a step, for the instant at which something strikes
 ROUNDING = 100.0  # of the size of the articulation, in units in the last place: no error is estimated to less
 
 
@@ -71,7 +72,7 @@ class RungeKutta(EnergyMomentum):
         flow = _Flow(terms, objective)
         h, start = step.dt[..., None], (state.q, self.velocity(a, state, step.dt))
         at, rates = start, [flow.rates(*start)]
-        touched = objective.push(state.q) > 0
+        off = touched = objective.push(state.q) > 0
         for row in STAGES:
             at = _moved(start, h, row, rates)
             rates.append(flow.rates(*at))
@@ -83,7 +84,12 @@ class RungeKutta(EnergyMomentum):
         error = torch.maximum(apart(a, a.topology.normalized(short), q), apart(a, later, q))
         moved = apart(a, state.q, q)
         least = ROUNDING * torch.finfo(q.dtype).eps * reach(a)
-        kept = ~touched & (error <= self.trust * moved + least) & flow.smooth & torch.isfinite(v).all(-1)
+        able = flow.smooth & ~off
+        good = able & (error <= self.trust * moved + least) & torch.isfinite(v).all(-1)
+        strike = torch.ones_like(error)
+        if bool((good & touched).any()):
+            found = first_strike(objective, h, (state.q, rates[0][0]), (at[0], rates[-1][0]))
+            strike = torch.where(good & touched, found, strike)
         now = place(a, q)
         nothing = torch.zeros_like(v)
         lag = flow.lag(now, v, rates[-1][1])
@@ -98,7 +104,32 @@ class RungeKutta(EnergyMomentum):
             surplus=state.surplus,
             peak=state.peak,
         )
-        return Leap(end, kept, error, 1 + len(STAGES))
+        stages = 1 + len(STAGES)
+        return Leap(end, good & ~touched, error, strike, stages * able.to(torch.int32), stages)
+
+
+def first_strike(objective: BalanceObjective, h: Tensor, start: Pair, end: Pair) -> Tensor:
+    """The share `[*batch]` of a step after which something first pushes on the cubic between q and q̇ at its start and at its end;
+    to 2^−33 and not after; 1: nothing does."""
+
+    def touches(x: Tensor) -> Tensor:
+        x = x[..., None]
+        y = 1 - x
+        ends = y * y * (1 + 2 * x) * start[0] + x * x * (3 - 2 * x) * end[0]
+        return objective.push(ends + h * x * y * (y * start[1] - x * end[1])) > 0
+
+    low = torch.zeros_like(h[..., 0].expand(start[0].shape[:-1]))
+    high = low + 2
+    for k in range(1, SCANS + 1):
+        x = torch.full_like(low, k / SCANS)
+        high = torch.where(touches(x) & (high > 1), x, high)
+        low = torch.where(high > 1, x, low)
+    there = high <= 1
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high.clamp_max(1))
+        found = touches(middle)
+        low, high = torch.where(found, low, middle), torch.where(found, middle, high)
+    return torch.where(there, low, 1.0)
 
 
 def _moved(start: Pair, h: Tensor, row: Sequence[float], rates: Sequence[Pair]) -> Pair:

@@ -29,6 +29,8 @@ from pbfd_torch.tensors.worlds import Worlds, replaced
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
 ORDER, EXPLICIT_ORDER = 3.0, 5.0  # of the error of one step
+BRINK, REST = 1e-6, 1e-4  # of the step, before a strike; of the frame, after it: less is not worth a step of its own
+CUTS = 5  # how often a step may be cut short
 
 
 class AdaptiveStepper(Generic[S]):
@@ -109,6 +111,8 @@ class _Frame(Generic[S]):
         self._state = replaced(state, pace=None, hazards=none)
         self._before = self._state  # at the start of the last step
         self._spacing = like + stepper.dt  # the step that the state's history is for
+        self._cut = like + torch.inf  # the step that ends where something strikes
+        self._cuts = none  # how often it has been cut short
         self._solution = Solution(
             q=state.q,
             status=torch.full_like(none, int(Status.EXPLICIT)),
@@ -128,21 +132,28 @@ class _Frame(Generic[S]):
         worlds = Worlds(tuple(left.shape), index)
         now, spacing, left = self._state.take(worlds), worlds.rows(self._spacing), worlds.rows(left)
         h = left / torch.ceil(left / torch.minimum(worlds.rows(self._pace), left) - 1e-6)
+        h, cuts = torch.minimum(h, worlds.rows(self._cut)), worlds.rows(self._cuts)
         held = None if self._control is None else worlds.pick(self._control, 1)
-        tried = _tried(self._fixed.take(worlds), now, spacing, h, held)
+        may_cut = (cuts < CUTS, (left - REST * self._stepper.dt) / h)
+        tried = _tried(self._fixed.take(worlds), now, spacing, h, held, may_cut)
 
         accuracy, solution = self._stepper.accuracy, tried.solution
         broken = solution.status == int(Status.NON_FINITE)
         shortest = h <= 1.001 * accuracy.shortest  # not but for rounding
-        taken = broken | shortest | ((tried.error <= accuracy.length) & solution.solved)
+        taken = ~tried.cut & (broken | shortest | ((tried.error <= accuracy.length) & solution.solved))
         order = torch.where(tried.explicit, EXPLICIT_ORDER, ORDER)
         factor = (SAFETY * (accuracy.length / tried.error) ** (1 / order)).nan_to_num(SHRINK).clamp(SHRINK, GROW)
         factor = torch.where(taken, factor, factor.clamp_max(0.5))
-        pace = (h * factor).clamp(accuracy.shortest, self._stepper.dt)
+        wish, before = h * factor, worlds.rows(self._pace)
+        # a step that was cut short does not slow down those that follow
+        pace = torch.where(taken & (cuts > 0) & (wish <= before), before, wish.clamp(accuracy.shortest, self._stepper.dt))
+        pace = torch.where(tried.cut, before, pace)
 
         everywhere = torch.ones_like(taken)
         self._elapsed = put(self._elapsed, worlds.rows(self._elapsed) + torch.where(broken, left, h), worlds, taken)
         self._pace = put(self._pace, pace, worlds, everywhere)
+        self._cut = put(self._cut, torch.where(tried.cut, tried.strike * h, torch.inf), worlds, everywhere)
+        self._cuts = put(self._cuts, torch.where(tried.cut, cuts + 1, 0), worlds, everywhere)
         self._spacing = put(self._spacing, torch.where(tried.explicit, h, 0.5 * h), worlds, taken)
         self._before = put(self._before, tried.before_last, worlds, taken)
         self._state = put(self._state, tried.end, worlds, taken)
@@ -187,28 +198,35 @@ class _Tried(Generic[S]):
     """A step of `n` worlds, made as a whole and, where that was not explicit, again as two halves.
 
     Attributes:
-        explicit: `[n]` bool.
+        explicit: `[n]` bool. cut: `[n]` bool, which is to be made again, to where something strikes, after a share `strike` `[n]`.
         error: `[n]` [m], how far the step is off.
         before_last, end: the states around the last of the steps that are to be kept: the whole one, or the second half.
         solution: with the worst status and error of these steps, and what all that was made has cost.
     """
 
     explicit: Tensor
+    cut: Tensor
+    strike: Tensor
     error: Tensor
     before_last: S
     end: S
     solution: Solution
 
 
-def _tried(stepper: Stepper[S], state: S, spacing: Tensor, h: Tensor, control: Tensor | None) -> _Tried[S]:
-    """A step of length h `[n]` from a state whose history is for steps of `spacing`."""
+def _tried(
+    stepper: Stepper[S], state: S, spacing: Tensor, h: Tensor, control: Tensor | None, may_cut: tuple[Tensor, Tensor]
+) -> _Tried[S]:
+    """A step of length h `[n]` from a state whose history is for steps of `spacing`. may_cut: whether it may be cut short where
+    something strikes, and the share of it where the latest cut may be, `[n]` each."""
     integrator, a = stepper.integrator, stepper.scene.articulation
     start = integrator.resized(a, state, spacing, h)
     coarse, first, _ = stepper.sized(h).made(start, control)
     explicit = first.status == int(Status.EXPLICIT)
     error = torch.zeros_like(h) if first.estimate is None else first.estimate
-    whole = _Tried(explicit, error, start, replaced(coarse, hazards=state.hazards | coarse.hazards), first)
-    index = (~explicit).nonzero().squeeze(-1)
+    strike = torch.ones_like(h) if first.strike is None else first.strike
+    cut = (strike < 1) & (strike > BRINK) & may_cut[0] & (strike <= may_cut[1])
+    whole = _Tried(explicit, cut, strike, error, start, replaced(coarse, hazards=state.hazards | coarse.hazards), first)
+    index = (~explicit & ~cut).reshape(-1).nonzero().squeeze(-1)
     if len(index) == 0:
         return whole
     worlds, everywhere = Worlds(tuple(explicit.shape), index), torch.ones_like(index, dtype=torch.bool)
@@ -238,6 +256,8 @@ def _tried(stepper: Stepper[S], state: S, spacing: Tensor, h: Tensor, control: T
     )
     return _Tried(
         explicit,
+        cut,
+        strike,
         put(whole.error, off, worlds, everywhere),
         put(whole.before_last, middle, worlds, everywhere),
         put(whole.end, end, worlds, everywhere),

@@ -184,7 +184,7 @@ class EagerStepper(Generic[S]):
         """The explicit step, and that of the other scheme in the worlds that may not make it."""
         leap = integrator.leap(self.scene.terms, objective, state)
         none = torch.zeros_like(leap.error)
-        count = torch.full_like(none, leap.evaluations, dtype=torch.int32)
+        count = leap.evaluations
         advanced, q = leap.end, leap.end.q
         solution = Solution(
             q=q,
@@ -194,6 +194,7 @@ class EagerStepper(Generic[S]):
             evaluations=count,
             fallbacks=count.new_zeros((*count.shape, len(FALLBACKS))),
             estimate=leap.error,
+            strike=leap.strike,
         )
         index = (~leap.kept).reshape(-1).nonzero().squeeze(-1)
         if len(index) == 0:
@@ -202,9 +203,14 @@ class EagerStepper(Generic[S]):
         everywhere = torch.ones_like(index, dtype=torch.bool)
         part = self.take(worlds).changed(integrator=other)
         end, found, leg = part.made(state.take(worlds), None if control is None else worlds.pick(control, 1))
-        found = dataclasses.replace(found, evaluations=found.evaluations + leap.evaluations, estimate=torch.zeros_like(end.time))
+        found = dataclasses.replace(
+            found,
+            evaluations=found.evaluations + worlds.rows(count),
+            estimate=torch.zeros_like(end.time),
+            strike=worlds.rows(leap.strike),
+        )
         whole = put(dataclasses.replace(solution, lanes=0), dataclasses.replace(found, lanes=0), worlds, everywhere)
-        solution = dataclasses.replace(whole, lanes=leap.evaluations * count.numel() + found.lanes)
+        solution = dataclasses.replace(whole, lanes=leap.stages * count.numel() + found.lanes)
         detour = Detour(worlds, everywhere, other, (leg.kept(),))
         return put(advanced, end, worlds, everywhere), solution, Way(q, (detour,), objective, explicit=True)
 

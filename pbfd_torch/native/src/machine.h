@@ -48,7 +48,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = eased = anew = leapt = struck = M(false), stiffest = estimate = V(0);
+    newton.running = eased = anew = leapt = cut = struck = M(false), stiffest = estimate = V(0);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     if (paced()) set_base(fresh);
@@ -76,6 +76,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   V stiffest;       // Δt² (∂r/∂q)/m in it
   V estimate;       // how far the end of its explicit step is off
   M leapt;          // it has made one
+  M cut;            // which is to be made again, to where something strikes
   M struck;         // something has pushed in its step of a frame
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
@@ -184,9 +185,13 @@ template <class V, class N, int D, class Scheme> struct Machine {
     for (int i = 0; i < W; i++) put(first, i, lane(fresh, i) && trips[i].first() && ways[i].way == DIRECTLY);
     leapt = leapt & !fresh;
     if (!any(first)) return;
-    const M made = first & scheme.leap.make(newton.balance, sight, before.q, velocity, stiffest, T(rules.trust));
-    for (int i = 0; i < W; i++)
-      if (lane(first, i)) trips[i].evaluations += STAGES;
+    M made = scheme.leap.make(newton.balance, sight, first, before.q, velocity, stiffest, T(rules.trust));
+    for (int i = 0; i < W; i++) {
+      if (!lane(scheme.leap.tried, i)) continue;
+      trips[i].evaluations += STAGES;
+      put(cut, i, paced() && lane(scheme.leap.strike, i) < T(1) && frames[i].cut(lane(scheme.leap.strike, i)));
+      put(made, i, lane(made, i) || lane(cut, i));
+    }
     leapt = leapt | made, estimate = select(first, select(made, scheme.leap.error, V(0)), estimate);
     newton.rest(made, scheme.leap.q);
   }
@@ -321,6 +326,10 @@ template <class V, class N, int D, class Scheme> struct Machine {
     M whole_step(false), half(false), judged(false), at_once(false), taken(false), again(false), over(false);
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i)) continue;
+      if (lane(cut, i)) {
+        frames[i].spend(trips[i]), put(again, i, true), put(fresh, i, true), embark(i, frames[i].next());
+        continue;
+      }
       frames[i].add(trips[i]);
       const Half made = frames[i].half;
       put(whole_step, i, made == WHOLE), put(half, i, made == FIRST_HALF);
@@ -339,7 +348,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
       if constexpr (Scheme::extrapolates) scheme.extrapolate(judged & !at_once & !struck, coarse, coarse_speed, after);
     }
     for (int i = 0; i < W; i++) {
-      if (!lane(ends, i)) continue;
+      if (!lane(ends, i) || lane(cut, i)) continue;
       Frame<T>& frame = frames[i];
       if (lane(judged, i)) put(taken, i, frame.judge(rules, lane(off, i)));
       const bool ended = lane(taken, i) && frame.over();
@@ -351,6 +360,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
         frame.half = Half(frame.half + 1);
       embark(i, frame.next());
     }
+    cut = cut & !ends;
     copy(plan, taken, after, base), copy(plan, taken & !at_once, middle, last), copy(plan, taken & at_once, before, last);
     copy(plan, again, base, before), copy(plan, over, base, after);
     if (any(again)) scheme.resize(again, spacing(), whole, before);
