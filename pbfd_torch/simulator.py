@@ -221,12 +221,16 @@ class Simulator(Generic[S]):
         return self.roller(self.stepper, state, controls, steps, progress)
 
 
+REBOUND = 2e-3  # [s], the shortest step in which contacts give way and push back
+
+
 class AdaptiveSimulator(Simulator[S]):
     """A `Simulator` whose steps, the frames, are made of as many shorter ones as each world needs (`AdaptiveStepper`).
 
     `dt`: length of a frame, and of the longest step [s]. `accuracy`: what a step's end may be off by, as estimated [m] > 0:
     the root mean square over the mass of a body, the largest of all bodies. `shortest`: a step that is never refused [s]; None:
-    dt/4096. `engine`: as in `Simulator`."""
+    dt/4096, and where contacts have restitution, which is a law of one step, 2 ms: shorter ones would take the rebound away.
+    `engine`: as in `Simulator`."""
 
     def __init__(
         self,
@@ -238,6 +242,8 @@ class AdaptiveSimulator(Simulator[S]):
         shortest: float | None = None,
         engine: Engine | None = None,
     ) -> None:
+        if shortest is None and any(getattr(term, "restitution", None) is not None for term in scene.terms):
+            shortest = min(dt, max(dt / 4096, REBOUND))
         self._accuracy = Accuracy.within(dt, accuracy, shortest)
         super().__init__(scene, dt, integrator, solver, halvings=0, engine=engine)
 
