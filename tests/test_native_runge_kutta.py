@@ -68,6 +68,9 @@ def test_steps_are_the_references(name: str) -> None:
         assert solution.estimate is not None
         assert other.estimate is not None
         torch.testing.assert_close(solution.estimate, other.estimate, rtol=1e-3, atol=1e-15)
+        assert solution.strike is not None
+        assert other.strike is not None
+        torch.testing.assert_close(solution.strike, other.strike, rtol=0, atol=1e-6)
         state = found
     assert explicit > 0
 

@@ -47,6 +47,7 @@ class _Steps(ctypes.Structure):
         ("before_last", ctypes.c_void_p * 10),
         ("trust", ctypes.c_double),
         ("estimate", ctypes.c_void_p),
+        ("strike", ctypes.c_void_p),
     )
 
 
@@ -100,7 +101,8 @@ class Journey:
         first, *others = COUNTED
         self.counted = {first: torch.empty((*steps, *batch), dtype=torch.int32)}
         self.counted |= {name: torch.empty_like(self.counted[first]) for name in others}
-        self._estimate: Tensor | None = None  # of explicit steps
+        self._estimate: Tensor | None = None  # of explicit steps, see `Solution`
+        self._strike: Tensor | None = None
         self.fallbacks = torch.empty((*steps, *batch, len(FALLBACKS)), dtype=torch.int32)
 
     def call(self, terms: Terms) -> _Steps:
@@ -118,8 +120,8 @@ class Journey:
         asked.own = self.own.data_ptr()
         asked.trust = terms.trust
         if terms.trust > 0 and self.frames is None:
-            self._estimate = torch.empty_like(self.residual_norm)
-            asked.estimate = self._estimate.data_ptr()
+            self._estimate, self._strike = torch.empty_like(self.residual_norm), torch.empty_like(self.residual_norm)
+            asked.estimate, asked.strike = self._estimate.data_ptr(), self._strike.data_ptr()
         asked.poses, asked.timed = self.poses.data_ptr(), self.poses.shape[1]
         if self.ways is not None:
             asked.halved, asked.eased, asked.ends = (x.data_ptr() for x in (self.ways.halved, self.ways.eased, self.ways.ends))
@@ -149,6 +151,7 @@ class Journey:
             fallbacks=self.fallbacks,
             lanes=lanes,
             estimate=self._estimate,
+            strike=self._strike,
             steps=steps,
             **counted,
         )

@@ -65,9 +65,9 @@ struct pbfd_steps {
   void *pace = nullptr, *spacing = nullptr;
   int* made = nullptr;
   void* before_last[10] = {};
-  // of explicit steps, if trust > 0, see `RungeKutta`: how far their ends are off, as estimated, [steps, worlds]
+  // of explicit steps, if trust > 0, see `RungeKutta` and `Explicit`: [steps, worlds]
   double trust = 0;
-  void* estimate = nullptr;
+  void *estimate = nullptr, *strike = nullptr;
 };
 
 // How many whole numbers and scalars the arrays of a plan hold, and the room [bytes] that a step needs, aligned to 64.

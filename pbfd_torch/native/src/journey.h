@@ -28,6 +28,14 @@ template <class T> struct Frames {
   void note(long to, T next, T length, int steps) const { pace[to] = next, spacing[to] = length, made[to] = steps; }
 };
 
+// How far the ends of explicit steps are off, as estimated, 0: the step was none; and after what share of one something would have
+// struck, 1: nothing. Null where there are none.
+template <class T> struct Explicit {
+  T *estimate, *strike;
+
+  void note(long to, T off, T share) const { estimate[to] = off, strike[to] = share; }
+};
+
 template <class T> struct Journey {
   int worlds, steps;
   bool held, alike;  // one control for all steps; one length of steps for all worlds
@@ -40,7 +48,7 @@ template <class T> struct Journey {
   Timetable<T> timetable;
   Ways<T> ways;
   Frames<T> frames;
-  T* estimate;  // of explicit steps; null: there are none
+  Explicit<T> explicitly;
 
   long at(int step, int world) const { return long(step) * worlds + world; }
   T step(int world) const { return dt[alike ? 0 : world]; }

@@ -10,7 +10,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 13; }
+int pbfd_interface() { return 14; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -27,7 +27,7 @@ template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, c
   return {s->worlds, s->steps, s->held != 0, s->alike != 0, static_cast<const T*>(s->dt), given,
           static_cast<const T*>(s->control), found, real(s->residual_norm), s->counted[0], s->counted[1], s->counted[2],
           s->counted[3], s->fallbacks, timetable<T>(p, s), {s->halved, s->eased, real(s->ends)},
-          {static_cast<const T*>(s->wish), real(s->pace), real(s->spacing), s->made, s->before_last}, real(s->estimate)};
+          {static_cast<const T*>(s->wish), real(s->pace), real(s->spacing), s->made, s->before_last}, {real(s->estimate), real(s->strike)}};
 }
 
 Rules rules(const pbfd_steps* s) {

@@ -48,7 +48,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = eased = anew = leapt = cut = struck = M(false), stiffest = estimate = V(0);
+    newton.running = eased = anew = leapt = cut = struck = M(false), stiffest = estimate = V(0), strike = V(1);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     if (paced()) set_base(fresh);
@@ -74,7 +74,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   M eased;          // it is posed an easier step
   M anew;           // it is posed another step than before
   V stiffest;       // Δt² (∂r/∂q)/m in it
-  V estimate;       // how far the end of its explicit step is off
+  V estimate, strike;  // how far the end of its explicit step is off; after what share of it something strikes
   M leapt;          // it has made one
   M cut;            // which is to be made again, to where something strikes
   M struck;         // something has pushed in its step of a frame
@@ -183,7 +183,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void leap(M fresh) {
     M first(false);
     for (int i = 0; i < W; i++) put(first, i, lane(fresh, i) && trips[i].first() && ways[i].way == DIRECTLY);
-    leapt = leapt & !fresh;
+    leapt = leapt & !fresh, estimate = select(first, V(0), estimate), strike = select(first, V(1), strike);
     if (!any(first)) return;
     M made = scheme.leap.make(newton.balance, sight, first, before.q, velocity, stiffest, T(rules.trust));
     for (int i = 0; i < W; i++) {
@@ -192,7 +192,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
       put(cut, i, paced() && lane(scheme.leap.strike, i) < T(1) && frames[i].cut(lane(scheme.leap.strike, i)));
       put(made, i, lane(made, i) || lane(cut, i));
     }
-    leapt = leapt | made, estimate = select(first, select(made, scheme.leap.error, V(0)), estimate);
+    leapt = leapt | made, estimate = select(made, scheme.leap.error, estimate);
+    strike = select(first, scheme.leap.strike, strike);
     newton.rest(made, scheme.leap.q);
   }
 
@@ -412,7 +413,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void report(int i) const {
     journey->report(at(i), paced() ? static_cast<const Tally<T>&>(frames[i]) : trips[i]);
     if (paced()) journey->frames.note(at(i), frames[i].pace, frames[i].spacing, frames[i].made);
-    if (journey->estimate) journey->estimate[at(i)] = lane(leapt, i) ? lane(estimate, i) : T(0);
+    if (journey->explicitly.estimate) journey->explicitly.note(at(i), lane(estimate, i), lane(strike, i));
     if (!journey->ways.ends) return;
     journey->ways.halved[at(i)] = trips[i].halvings;
     if (trips[i].whole()) note(i, 0, trips[i].status == EXPLICIT ? EXPLICIT : trips[i].kept, after.q);
