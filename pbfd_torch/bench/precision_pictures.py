@@ -23,7 +23,7 @@ FLOOR = 1e-12  # smaller errors are drawn here
 COLORS = ("#000000", "#e8a400", "#2ca02c", "#d62728", "#8c564b", "#17becf")  # ours
 ADAPTIVE_STYLES: Mapping[str, Mapping[str, Any]] = {
     ADAPTIVE["energy-momentum"]: {"color": "#c000c0", "marker": "*"},
-    ADAPTIVE["runge-kutta"]: {"color": "#8c564b", "marker": "*"},
+    ADAPTIVE["runge-kutta"]: {"color": "#ff69b4", "marker": "*"},
 }
 PEER_STYLES: Mapping[str, dict[str, Any]] = {
     "Euler": {"color": "0.65", "marker": "s"},

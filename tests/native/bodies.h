@@ -79,8 +79,9 @@ struct Run {
     for (auto& x : trial) x.resize(count * NQ);
   }
 
-  // own: numbers of each world, where the plan says which these are. accuracy: of frames, 0: steps, whose ways are asked for.
-  void make(const Scene& scene, Step step, double dt, const double* own = nullptr, double accuracy = 0) {
+  // own: numbers of each world, where the plan says which these are. accuracy: of frames, 0: steps, whose ways are asked for. trust:
+  // of explicit steps.
+  void make(const Scene& scene, Step step, double dt, const double* own = nullptr, double accuracy = 0, double trust = 0) {
     void* room = std::aligned_alloc(64, (pbfd_room(&scene.plan) + 127) / 64 * 64);
     pbfd_steps s{&dt, 1, HALVINGS, 1e-9, 1e-3, 1, 1e300, 5000, worlds, 0, worlds, steps, 1, {}, nullptr, {}, residual_norm.data(), {}, fallbacks.data(), own, {}};
     if (accuracy > 0) {
@@ -90,6 +91,8 @@ struct Run {
     } else {
       s.halved = halved.data(), s.eased = eased.data(), s.ends = ends.data();
     }
+    std::vector<double> estimate(residual_norm.size()), strike(residual_norm.size());
+    s.trust = trust, s.estimate = estimate.data(), s.strike = strike.data();
     for (std::size_t i = 0; i < given.size(); i++) s.given[i] = given[i].data(), s.found[i] = found[i].data();
     for (int i = 0; i < 4; i++) s.counted[i] = counted[i].data();
     for (int i = 0; i < 7; i++) s.trial[i] = trial[i].data();

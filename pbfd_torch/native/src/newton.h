@@ -44,7 +44,7 @@ template <class V, class N, int D = 3> struct Newton {
     for (int i = 0; i < plan.nv; i++) direction[i] = V(0);
     length = start_work = low = low_work = low_curve = high = high_work = high_curve = V(0);
     error = status = evaluations = iterations = V(0), far = V(1);
-    running = at_guess = at_retreat = searching = M(false);
+    running = at_guess = at_retreat = searching = M(false), settled = false;
   }
 
   // Lanes set out from a guess; θ_n is the retreat of those that have one. Their balance has been begun.
