@@ -10,7 +10,8 @@ import pytest
 import torch
 from tqdm import tqdm
 
-from pbfd_torch.cli.options import Choices, Friction, SolverChoice
+from pbfd_torch.cli.options import Choices, Friction, Integrator, SolverChoice
+from pbfd_torch.integrators.named import INTEGRATORS
 from pbfd_torch.native.library import library
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.simulator import Simulator
@@ -70,6 +71,15 @@ def test_engine(pbfd: Pbfd) -> None:
         ours, theirs = (pbfd("simulate", "hopper", *short, *other, "--engine", name).data for name in ("native", "torch"))
         assert (ours["engine"], theirs["engine"]) == ("native", "torch")
         assert ours["energy_end_J"] == pytest.approx(theirs["energy_end_J"], rel=1e-6)
+
+
+@pytest.mark.parametrize("choice", Integrator)
+def test_integrators(pbfd: Pbfd, choice: Integrator) -> None:
+    """Each that there is has a name here; how many steps were explicit is told."""
+    assert {x.value for x in Integrator} == set(INTEGRATORS)
+    data = pbfd("simulate", "chain-fixed", "--integrator", choice, "--dt", "0.005", "--duration", "0.05", "--json").data
+    assert (data["integrator"], data["solved_fraction"]) == (choice.value, 1.0)
+    assert data["explicit_steps"] == (10 if choice is Integrator.RUNGE_KUTTA else 0)
 
 
 def test_table_names_the_scene_and_its_numbers(pbfd: Pbfd) -> None:

@@ -38,6 +38,7 @@ class Integrator(enum.StrEnum):
     BDF2 = "bdf2"
     VARIATIONAL = "variational"
     ENERGY_MOMENTUM = "energy-momentum"
+    RUNGE_KUTTA = "runge-kutta"
 
 
 class SolverChoice(enum.StrEnum):
