@@ -127,7 +127,6 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
         self.randomization = randomization
         self.setup = self.make_setup(dtype, torch.device(device))
         self.scene = self.setup.scene
-        # a world that is hard to solve ends sooner than others wait for it
         self.accuracy = accuracy
         self.simulator = self._simulator(integrator)
         self._worlds = None if randomization is None else DrawnWorlds(self.simulator, randomization)
@@ -144,6 +143,7 @@ class PbfdEnv(EnvBase):  # type: ignore[misc]  # torchrl has no types
 
     def _simulator(self, integrator: Integrator[Any] | None) -> Simulator[Any]:
         if self.accuracy is None:
+            # a world that is hard to solve ends sooner than others wait for it
             return Simulator(self.scene, self.dt, integrator or ImplicitEuler(), halvings=HALVINGS)
         if self.substeps > 1:
             raise InputError(f"dt is {self.dt} s and accuracy {self.accuracy} m: only one of them may be given")

@@ -159,8 +159,8 @@ def test_a_step_waits_once_a_round_and_once_more(scene: str, integrator: str, si
 
 
 @pytest.mark.parametrize("scene", ["chain-ground", "box-slide"])
-def test_an_explicit_step_waits_once(scene: str) -> None:
-    """To know which worlds may not make it; here all may: they fly."""
+def test_an_explicit_step_waits_twice(scene: str) -> None:
+    """To know whether anything strikes, and which worlds may not make it; here all may: they fly."""
     begun = start(scene, "runge-kutta")
     with make_believe():
         q = begun.state.q.clone()
