@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, fresh
 from pbfd_torch.native.stepper import NativeStepper, spread
 from pbfd_torch.solvers.objective import Solution, Status
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.kinematics import difference
@@ -59,25 +60,66 @@ def at_once(eager: EagerStepper[S]) -> EagerStepper[S]:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """A step of both: where they end, how the core's was solved, which worlds both solve directly, and which of them alike."""
+    """Steps of the core one after another, and the reference's from where each of them begins: as one batch `[steps · worlds]`,
+    which takes PyTorch hardly longer than one of them.
 
-    after: Velocities
-    reference: Velocities
+    Attributes:
+        stepper: the reference.
+        before, control: where each step begins, and what it is given.
+        after, solution: of the core.
+        expected, found: of the reference.
+        both: which both solve directly; unless asked otherwise.
+        alike: which of these end at the same root.
+    """
+
+    stepper: EagerStepper[Any]
+    before: Any
+    control: Tensor | None
+    after: Any
     solution: Solution
-    both: Tensor
-    alike: Tensor
+    expected: Any
+    found: Solution
+
+    @property
+    def both(self) -> Tensor:
+        return (self.solution.status == int(Status.SOLVED)) & (self.found.status == int(Status.SOLVED))
+
+    @property
+    def alike(self) -> Tensor:
+        return self.both & self.near
+
+    @property
+    def near(self) -> Tensor:
+        return (self.after.q - self.expected.q).abs().amax(-1) < 1e-7
+
+    def require_roots(self, tolerance: float = 1e-9) -> None:
+        """What the core solves directly are roots by the reference's own error."""
+        objective = self.stepper.objective(self.before, self.control)
+        error = objective.error(objective.evaluate(self.after.q), tolerance)
+        assert bool((error[self.solution.status == int(Status.SOLVED)] <= tolerance).all())
+
+    def require_alike(self, names: Sequence[str], rtol: float = 1e-5, atol: float = 1e-5, where: Tensor | None = None) -> None:
+        """Fields of the states that follow, where they end at the same root."""
+        where = self.alike if where is None else where
+        for name in names:
+            ours, theirs = (getattr(x, name)[where].double() for x in (self.after, self.expected))
+            assert torch.allclose(ours, theirs, rtol, atol), name
+
+    def require_same(self, share: float = 0.97) -> None:
+        """So many that both solve directly, and there are some, end at the same root."""
+        assert int(self.alike.sum()) >= share * int(self.both.sum()) > 0
 
 
-def compared(native: NativeStepper[Velocities], state: Velocities, control: Tensor | None) -> Compared:
-    """The step of the core and of the reference. What the core solves directly are roots by the reference's own error."""
-    after, solution, _ = native.made(state, control)
-    objective = native.eager.objective(state, control)
-    plain = solution.status == int(Status.SOLVED)
-    error = objective.error(objective.evaluate(after.q), 1e-9)
-    assert bool((error[plain] <= 1e-9).all())
-    reference, eager, _ = at_once(native.eager).made(state, control)
-    both = plain & (eager.status == int(Status.SOLVED))
-    return Compared(after, reference, solution, both, both & ((after.q - reference.q).abs().amax(-1) < 1e-7))
+def compared(native: NativeStepper[Any], state: Any, controls: Tensor | None, steps: int, fallbacks: bool = False) -> Compared:
+    """Under controls `[steps, worlds, nu]`, or `[1, worlds, nu]` for all of them; the reference with its fallbacks or without."""
+    states, solution = native.run(state, controls, steps)
+    before = mapped(lambda first, others: torch.cat((first[None], others[:-1])).flatten(0, 1), native.complete(state), states)
+    control = None if controls is None else controls.expand(steps, *controls.shape[1:]).flatten(0, 1)
+    worlds = len(state.q)
+    stepper = native.eager.take(Worlds((worlds,), torch.arange(worlds).repeat(steps)))
+    expected, found, _ = (stepper if fallbacks else at_once(stepper)).made(before, control)
+    after, solution = (mapped(lambda x: x.flatten(0, 1), x) for x in (states, solution))
+    return Compared(stepper, before, control, after, solution, expected, found)
 
 
 def require_steps(scene: Scene, start: Velocities, control: Tensor | None = None, steps: int = 5) -> None:
@@ -86,15 +128,10 @@ def require_steps(scene: Scene, start: Velocities, control: Tensor | None = None
     native = NativeStepper(simulator.eager)
     state = simulator.initial_state(start.q, start.v, control)
     worlds = len(start.q)
-    direct = same = 0
-    for _ in range(steps):
-        step = compared(native, state, control)
-        direct, same = direct + int(step.both.sum()), same + int(step.alike.sum())
-        for field in ("v", "push", "steady", "lag", "surplus", "hazards"):
-            ours, theirs = (getattr(x, field)[step.alike] + 0.0 for x in (step.after, step.reference))
-            assert torch.allclose(ours, theirs, 1e-5, 1e-5), field
-        state = step.after
-    assert same >= 0.97 * direct > 0
+    pairs = compared(native, state, None if control is None else control[None], steps)
+    pairs.require_roots()
+    pairs.require_same()
+    pairs.require_alike(("v", "push", "steady", "lag", "surplus", "hazards"))
     whole, _, _ = native.made(state, control)
     for index in (torch.tensor([3]), torch.tensor([worlds - 1, 0, 3])):
         held = None if control is None else control[index]
@@ -185,24 +222,17 @@ def largest_gap(eager: EagerStepper[Any], q: Tensor, ours: Any, theirs: Any) -> 
 
 
 def require_same_steps(native: NativeStepper[Any], state: Any, steps: int, least: int) -> None:
-    """Steps from a state on, each from where the core's last one ended: at least so many end in the same way as the reference's,
-    97 % of these in the same state."""
-    direct = same = 0
-    for _ in range(steps):
-        after, solution, _ = native.made(state, None)
-        expected, found, _ = native.eager.made(state, None)
-        both = (solution.status == found.status) & (found.status <= int(Status.EASED))
-        alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert torch.equal(after.time, expected.time)
-        assert torch.equal(after.hazards[alike], expected.hazards[alike])
-        for name, ours in vars(after).items():
-            theirs = getattr(expected, name)
-            if isinstance(ours, Tensor) and ours.dtype == torch.float64:
-                assert torch.allclose(ours[alike], theirs[alike], rtol=1e-5, atol=1e-3, equal_nan=True), name
-        state = after
-    assert direct >= least
-    assert same >= 0.97 * direct
+    """At least so many end in the same way as the reference's, 97 % of these in the same state."""
+    pairs = compared(native, state, None, steps, fallbacks=True)
+    both = (pairs.solution.status == pairs.found.status) & (pairs.found.status <= int(Status.EASED))
+    alike = both & pairs.near
+    assert torch.equal(pairs.after.time, pairs.expected.time)
+    assert torch.equal(pairs.after.hazards[alike], pairs.expected.hazards[alike])
+    for name, ours, theirs in fields(pairs.after, pairs.expected):
+        if ours.dtype == torch.float64:
+            assert torch.allclose(ours[alike], theirs[alike], rtol=1e-5, atol=1e-3, equal_nan=True), name
+    assert int(both.sum()) >= least
+    assert int(alike.sum()) >= 0.97 * int(both.sum())
 
 
 def require_single_precision(scene: Callable[[torch.dtype], Scene], start: Callable[[Scene], Velocities]) -> None:

@@ -20,6 +20,7 @@ from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import FALLBACKS, Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.tensors.worlds import Worlds
+from tests.native_parity import compared
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -62,19 +63,14 @@ def test_starts(name: str) -> None:
 @pytest.mark.parametrize("name", COVERED)
 def test_steps(name: str, dt: float) -> None:
     """The same root from the same state, refused alike where a contact force jumps, and what is remembered is the same."""
-    simulator, native, state, controls = begun(name, dt)
-    direct = same = 0
-    for control in controls[:10]:
-        after, solution, _ = native.made(state, control)
-        expected, found, _ = simulator.eager.made(state, control)
-        kinds = [int(Status.SOLVED), int(Status.EASED)]
-        both = (solution.status == found.status) & torch.isin(solution.status, torch.tensor(kinds, dtype=torch.int32))
-        alike = both & ((after.q - expected.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert gap(after, expected, alike) < 1e-6
-        assert torch.allclose(after.push[alike], expected.push[alike], rtol=1e-4, atol=1e-6)
-        state = expected
-    assert same >= 0.97 * direct > 0
+    _, native, state, controls = begun(name, dt)
+    pairs = compared(native, state, controls[:10], 10, fallbacks=True)
+    kinds = [int(Status.SOLVED), int(Status.EASED)]
+    both = (pairs.solution.status == pairs.found.status) & torch.isin(pairs.solution.status, torch.tensor(kinds, dtype=torch.int32))
+    alike = both & pairs.near
+    assert gap(pairs.after, pairs.expected, alike) < 1e-6
+    pairs.require_alike(["push"], 1e-4, 1e-6, alike)
+    assert int(alike.sum()) >= 0.97 * int(both.sum()) > 0
 
 
 def test_jumps_of_a_contact_force_are_refused() -> None:

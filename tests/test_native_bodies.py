@@ -23,7 +23,7 @@ from pbfd_torch.terms.body_contact import BodyContact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.friction_law import FrictionLaw
 from pbfd_torch.tree.kinematics import retract
-from tests.native_parity import at_once, require_balance, resting
+from tests.native_parity import compared, require_balance, resting
 from tests.native_piles import SHAPES, pile, thrown_together
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
@@ -72,25 +72,17 @@ def test_steps(name: str, law: str, integrator: str) -> None:
     native = simulator.stepper
     assert isinstance(native, NativeStepper), simulator.engine_reason
     state = simulator.initial_state(*thrown_together(simulator.scene, WORLDS))
-    direct = same = left = 0
-    for _ in range(1 if law == "coulomb" else 2):
-        after, solution, _ = native.made(state, None)
-        objective = native.eager.objective(state, None)
-        plain = solution.status == int(Status.SOLVED)
-        changed = objective.error(objective.evaluate(after.q), 1e-9)[plain] > 1e-9
-        assert int(changed.sum()) <= 1
-        reference, eager, _ = at_once(native.eager).made(state, None)
-        both = plain & (eager.status == int(Status.SOLVED))
-        alike = both & ((after.q - reference.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert torch.equal(after.hazards[alike], reference.hazards[alike])
-        for ours, theirs in zip(remembered(after), remembered(reference), strict=True):
-            assert torch.allclose(ours[alike], theirs[alike], 1e-5, 1e-8)
-        left += int((solution.status > int(Status.HALVED)).sum())
-        state = after
-    assert direct - same <= max(1, 0.03 * direct)  # bodies that overlap deep have several roots
+    pairs = compared(native, state, None, 1 if law == "coulomb" else 2)
+    objective = pairs.stepper.objective(pairs.before, None)
+    plain = pairs.solution.status == int(Status.SOLVED)
+    assert int((objective.error(objective.evaluate(pairs.after.q), 1e-9)[plain] > 1e-9).sum()) <= 1
+    direct, alike = int(pairs.both.sum()), pairs.alike
+    pairs.require_alike(["hazards"], 0, 0)
+    for ours, theirs in zip(remembered(pairs.after), remembered(pairs.expected), strict=True):
+        assert torch.allclose(ours[alike], theirs[alike], 1e-5, 1e-8)
+    assert direct - int(alike.sum()) <= max(1, 0.03 * direct)  # bodies that overlap deep have several roots
     assert direct > 0
-    assert left <= 1
+    assert int((pairs.solution.status > int(Status.HALVED)).sum()) <= 1
 
 
 @pytest.mark.parametrize("name", ["balls on boxes", "polytopes"])

@@ -15,11 +15,10 @@ from pbfd_torch.models import SCENES
 from pbfd_torch.native.calls import Calls
 from pbfd_torch.native.library import library
 from pbfd_torch.native.stepper import NativeStepper
-from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.tree.kinematics import retract
 from tests.curved_piles import CURVED, share_points
-from tests.native_parity import DT, at_once, compared, gaps, resting
+from tests.native_parity import DT, compared, gaps, resting
 from tests.native_piles import pile, thrown_together
 from tests.test_native_records import recorded, require_same
 
@@ -73,16 +72,9 @@ def test_steps(name: str, integrator: type[Integrator[Any]]) -> None:
     simulator = Simulator(pile(CURVED[name]), DT, integrator())
     q, v = thrown_together(simulator.scene, 8)
     state, native = simulator.initial_state(q, v), NativeStepper(simulator.eager)
-    direct = same = 0
-    for _ in range(2):
-        after, solution, _ = native.made(state, None)
-        reference, eager, _ = at_once(native.eager).made(state, None)
-        both = (solution.status == int(Status.SOLVED)) & (eager.status == int(Status.SOLVED))
-        alike = both & ((after.q - reference.q).abs().amax(-1) < 1e-7)
-        direct, same = direct + int(both.sum()), same + int(alike.sum())
-        assert torch.equal(after.hazards[alike], reference.hazards[alike])
-        state = after
-    assert same >= 0.97 * direct > 0
+    pairs = compared(native, state, None, 2)
+    pairs.require_same()
+    pairs.require_alike(["hazards"], 0, 0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -117,19 +109,16 @@ def test_robot_arm() -> None:
     simulator, state, controls = arm(8)
     assert simulator.engine == "native"
     native = NativeStepper(simulator.eager)
-    direct = same = 0
-    for control in controls:
-        objective = simulator.eager.objective(state, control)
-        at = off(simulator.scene, objective.guess, 0.001)
-        residual, jacobian = native._core.balance(state, control, at)
-        expected = objective.evaluate(at)
-        for ours, theirs in ((residual, expected.residual), (jacobian, expected.jacobian)):
-            assert float((ours - theirs).abs().max()) < 1e-9 * float(theirs.abs().max())
-        step = compared(native, state, control)
-        direct, same = direct + int(step.both.sum()), same + int(step.alike.sum())
-        assert torch.equal(step.after.hazards[step.alike], step.reference.hazards[step.alike])
-        state = step.after
-    assert same >= 0.97 * direct > 0
+    pairs = compared(native, state, controls, len(controls))
+    objective = pairs.stepper.objective(pairs.before, pairs.control)
+    at = off(simulator.scene, objective.guess, 0.001)
+    residual, jacobian = native._core.balance(pairs.before, pairs.control, at)
+    expected = objective.evaluate(at)
+    for ours, theirs in ((residual, expected.residual), (jacobian, expected.jacobian)):
+        assert float(((ours - theirs).abs() / theirs.abs().max()).max()) < 1e-9
+    pairs.require_roots()
+    pairs.require_same()
+    pairs.require_alike(["hazards"], 0, 0)
 
 
 @pytest.mark.usefixtures("shared")

@@ -30,7 +30,7 @@ from pbfd_torch.terms.pbfd_friction import PbfdFriction
 from pbfd_torch.terms.restitution import Restitution
 from pbfd_torch.terms.static_friction import StaticFriction
 from pbfd_torch.tree.kinematics import place, retract
-from tests.native_parity import DT, at_once, require_balance, require_single_precision, require_starts, require_steps, resting
+from tests.native_parity import DT, compared, require_balance, require_single_precision, require_starts, require_steps, resting
 from tests.native_piles import SHAPES, pile, thrown_together
 from tests.test_native_contact import BALLS, GROUND, SOLIDS, WALL, beside, touching
 from tests.test_native_records import recorded, require_same
@@ -74,22 +74,12 @@ def require_fallbacks_alike(scene: Scene, q: torch.Tensor, v: torch.Tensor, step
     for scheme in SCHEMES:
         simulator = Simulator(scene, DT, scheme)
         native = NativeStepper(simulator.eager)
-        state = native.initial_state(q, v, None)
-        direct = same = ours_plain = theirs_plain = 0
-        for _ in range(steps):
-            ours, solution, _ = native.made(state, None)
-            theirs, reference, _ = at_once(native.eager).made(state, None)
-            plain = solution.status == int(Status.SOLVED)
-            objective = native.eager.objective(state, None)
-            assert bool((objective.error(objective.evaluate(ours.q), 1e-9)[plain] <= 1e-9).all())
-            both = plain & (reference.status == int(Status.SOLVED))
-            alike = both & ((ours.q - theirs.q).abs().amax(-1) < 1e-7)
-            assert torch.equal(ours.hazards[alike], theirs.hazards[alike])
-            direct, same = direct + int(both.sum()), same + int(alike.sum())
-            ours_plain, theirs_plain = ours_plain + int(plain.sum()), theirs_plain + int((reference.status == 0).sum())
-            state = ours
-        assert same >= 0.97 * direct > 0
-        assert -0.05 <= (ours_plain - theirs_plain) / (steps * len(q)) <= fewer
+        pairs = compared(native, native.initial_state(q, v, None), None, steps)
+        pairs.require_roots()
+        pairs.require_same()
+        assert torch.equal(pairs.after.hazards[pairs.alike], pairs.expected.hazards[pairs.alike])
+        plain = [int((x.status == int(Status.SOLVED)).sum()) for x in (pairs.solution, pairs.found)]
+        assert -0.05 <= (plain[0] - plain[1]) / (steps * len(q)) <= fewer
 
 
 def require_records(scene: Scene, q: torch.Tensor, v: torch.Tensor, steps: int = 6) -> None:

@@ -50,16 +50,11 @@ def test_parity(name: str, dt: float) -> None:
     worlds, steps = 11, 8
     simulator, state = started(name, dt, worlds)
     native = NativeStepper(simulator.eager)
-    direct, same = 0, 0
-    for control in controls(simulator, steps, worlds):
-        step = compared(native, state, control)
-        assert bool(step.solution.solved.all())
-        direct, same = direct + int(step.both.sum()), same + int(step.alike.sum())
-        for field in FIELDS:
-            a, b = getattr(step.after, field)[step.alike], getattr(step.reference, field)[step.alike]
-            assert torch.allclose(a.double(), b.double(), rtol=1e-5, atol=1e-6), field
-        state = step.after
-    assert same >= 0.97 * direct > 0
+    pairs = compared(native, state, controls(simulator, steps, worlds), steps)
+    assert bool(pairs.solution.solved.all())
+    pairs.require_roots()
+    pairs.require_same()
+    pairs.require_alike(FIELDS, 1e-5, 1e-6)
 
 
 @pytest.mark.parametrize("name", ["hopper", "chain-ground"])

@@ -23,7 +23,6 @@ from pbfd_torch.native.library import library
 from pbfd_torch.native.plan import planned
 from pbfd_torch.native.stepper import NativeStepper, uncovered
 from pbfd_torch.solvers.fallbacks import Fallbacks
-from pbfd_torch.solvers.objective import Status
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuator, Actuators
 from pbfd_torch.terms.contact import Contact
@@ -39,7 +38,7 @@ from pbfd_torch.tree.articulation import homogeneous
 from pbfd_torch.tree.kinematics import place, retract
 from pbfd_torch.tree.rotations import quaternion_exp, quaternion_matrix
 from tests.bodies import diagonal
-from tests.native_parity import DT, at_once, require_balance, require_steps, resting
+from tests.native_parity import DT, compared, require_balance, require_steps, resting
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
 
@@ -278,18 +277,12 @@ def test_everything_at_once(scheme: Any, dtype: torch.dtype) -> None:
     simulator: Simulator[Any] = Simulator(scene, DT, scheme())
     native, tolerance = NativeStepper(simulator.eager), Fallbacks().direct.tolerance_for(dtype)
     beside, _ = start(scene)
-    state, held, solved = simulator.initial_state(beside.q, 0.1 * beside.v), control(scene), 0
-    for _ in range(5):
-        after, solution, _ = native.made(state, held)
-        objective = simulator.eager.objective(state, held)
-        plain = solution.status == int(Status.SOLVED)
-        assert bool((objective.error(objective.evaluate(after.q), tolerance)[plain] <= tolerance).all())
-        reference, eager, _ = at_once(simulator.eager).made(state, held)
-        both = plain & (eager.status == int(Status.SOLVED))
-        near = (after.q - reference.q).abs().amax(-1) < (1e-7 if dtype == torch.float64 else 1e-3)
-        assert int((both & near).sum()) >= 0.95 * int(both.sum())
-        state, solved = after, solved + int(both.sum())
-    assert solved > 0.8 * 5 * WORLDS
+    state, held = simulator.initial_state(beside.q, 0.1 * beside.v), control(scene)
+    pairs = compared(native, state, held[None], 5)
+    pairs.require_roots(tolerance)
+    near = (pairs.after.q - pairs.expected.q).abs().amax(-1) < (1e-7 if dtype == torch.float64 else 1e-3)
+    assert int((pairs.both & near).sum()) >= 0.95 * int(pairs.both.sum())
+    assert int(pairs.both.sum()) > 0.8 * 5 * WORLDS
 
 
 def test_a_solid_of_its_own_for_each_candidate() -> None:
