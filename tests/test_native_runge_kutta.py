@@ -16,8 +16,10 @@ from pbfd_torch.models.setup import Setup
 from pbfd_torch.native.engine import Native, Torch
 from pbfd_torch.native.library import library
 from pbfd_torch.native.plan import planned
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.tensors.worlds import Worlds
 from pbfd_torch.tree.kinematics import retract
+from tests.native_parity import compared
 from tests.random_trees import generator
 
 pytestmark = pytest.mark.skipif(library() is None, reason="there is no compiled core")
@@ -55,24 +57,14 @@ def test_steps_are_the_references(name: str) -> None:
     setup = SCENES[name](worlds=6)
     ours, theirs = simulators(setup.scene)
     q, v, control = thrown(setup)
-    state, explicit = theirs.initial_state(q, v, control), 0
-    for _ in range(8):
-        found, solution = ours.step(state, control)
-        expected, other = theirs.step(state, control)
-        assert torch.equal(solution.status == EXPLICIT, other.status == EXPLICIT)
-        leapt = solution.status == EXPLICIT
-        explicit += int(leapt.sum())
-        for field in ("q", "v", "push", "steady", "lag", "average", "gained", "surplus", "peak"):
-            one, two = getattr(found, field)[leapt], getattr(expected, field)[leapt]
-            torch.testing.assert_close(one, two, rtol=1e-9, atol=1e-11, msg=field)
-        assert solution.estimate is not None
-        assert other.estimate is not None
-        torch.testing.assert_close(solution.estimate, other.estimate, rtol=1e-3, atol=1e-15)
-        assert solution.strike is not None
-        assert other.strike is not None
-        torch.testing.assert_close(solution.strike, other.strike, rtol=0, atol=1e-6)
-        state = found
-    assert explicit > 0
+    pairs = compared(NativeStepper(ours.eager), theirs.initial_state(q, v, control), control[None], 8, fallbacks=True)
+    leapt = pairs.solution.status == EXPLICIT
+    assert torch.equal(leapt, pairs.found.status == EXPLICIT)
+    assert int(leapt.sum()) > 0
+    pairs.require_alike(("q", "v", "push", "steady", "lag", "average", "gained", "surplus", "peak"), 1e-9, 1e-11, leapt)
+    for name, rtol, atol in (("estimate", 1e-3, 1e-15), ("strike", 0, 1e-6)):
+        one, two = (getattr(x, name) for x in (pairs.solution, pairs.found))
+        torch.testing.assert_close(one, two, rtol=rtol, atol=atol)
 
 
 def test_a_plane_and_space() -> None:
