@@ -15,13 +15,14 @@ from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.show import view
-from pbfd_torch.simulator import Simulator
+from pbfd_torch.simulator import AdaptiveSimulator, EventSimulator, Simulator
 from pbfd_torch.solvers.descent import Descent
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.tree.articulation import Articulation, Joint, JointKind, Link
 
 __all__ = [
+    "AdaptiveSimulator",
     "Articulation",
     "Bdf2",
     "Blur",
@@ -31,6 +32,7 @@ __all__ = [
     "Doubt",
     "Doubtful",
     "EnergyMomentum",
+    "EventSimulator",
     "Fallbacks",
     "GradientError",
     "GradientWarning",

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable
 from typing import Any, Generic, Self
 
+import torch
 from torch import Tensor
 
 from pbfd_torch.balance.objective import BalanceObjective
@@ -16,13 +17,15 @@ from pbfd_torch.gradients.linearization import Linearization, linearized
 from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.gradients.parts import Carriers
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
-from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.integrator import Integrator, Leaping, S
+from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.native.engine import Engine, chosen
 from pbfd_torch.native.rollout import rolled_out as many_rolled_out
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.schedules.adaptive import AdaptiveStepper
+from pbfd_torch.schedules.events import EventStepper, made_with_events
 from pbfd_torch.schedules.lock_step import rolled_out
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.stepping.accuracy import Accuracy
@@ -273,6 +276,79 @@ class AdaptiveSimulator(Simulator[S]):
     def linearize(self, *_: Any, **__: Any) -> Linearization[S]:
         """Raises `InputError`, as `trajectory` does."""
         raise InputError(ROLLOUTS_ONLY)
+
+
+class EventSimulator(Simulator[S]):
+    """A `Simulator` whose steps are cut where something strikes on the way of an explicit one (`schedules.events`): up to there,
+    and from there on. So impacts happen when they should, and derivatives go through them.
+
+    `integrator`: one that makes explicit steps, `RungeKutta`; None: that one. The rest: as in `Simulator`. Raises `InputError`
+    for others. A step is cut at most five times, and no closer to its start than 1e-6 of it: what strikes again so soon, and what
+    strikes while something else presses, does so within a step as in a `Simulator`. The solution's `strike` is the share of the
+    step after which something first strikes, its `steps` the parts of it. Each part is a call of its own, and a rollout is not
+    one call of the core."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        dt: float,
+        integrator: Integrator[S] | None = None,
+        solver: Solver | None = None,
+        halvings: int = 3,
+        gradients: Gradients | None = None,
+        engine: Engine | None = None,
+    ) -> None:
+        chosen_one: Integrator[Any] = RungeKutta() if integrator is None else integrator
+        if not isinstance(chosen_one, Leaping):
+            name = type(chosen_one).__name__
+            raise InputError(f"integrator is {name}: an EventSimulator needs one that makes explicit steps, such as RungeKutta")
+        super().__init__(scene, dt, chosen_one, solver, halvings, gradients, engine=engine)
+
+    def _stepping(self) -> tuple[Stepper[S], str, str]:
+        if self._made is None:
+            _, name, reason = super()._stepping()
+            self._made = EventStepper(self.eager, self._maker), name, reason
+        return self._made
+
+    def _maker(self, eager: EagerStepper[Any]) -> Stepper[Any]:
+        return chosen(eager)[0] if self._engine is None else self._engine.stepper(eager)
+
+    def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
+        """See `Simulator.step` and `schedules.events.made_with_events`."""
+
+        def make(eager: EagerStepper[Any], start: Any, held: Tensor | None) -> tuple[Any, Solution]:
+            linked = Linked(eager, self.gradients, self._maker)
+            if not linked.carry(start, held):
+                return self._maker(eager).made(start, held)[:2]
+            end, made = linked.step(start, held)
+            return end, made.solution
+
+        return made_with_events(make, self.eager, state, self.scene.controlled(control, state.q.shape[:-1]))
+
+    def trajectory(
+        self,
+        state: S,
+        controls: Tensor | None = None,
+        steps: int | None = None,
+        checkpoint: int = 1,
+        progress: Callable[[int], object] | None = None,
+    ) -> Trajectory[S]:
+        """See `Simulator.trajectory`; every state is kept: raises `InputError` for another checkpoint than 1."""
+        if checkpoint != 1:
+            raise InputError(f"checkpoint is {checkpoint}: steps that are cut keep every state, so it must be 1")
+        states, status = [state], []
+        for k in range(self.scene.step_count(controls, steps)):
+            state, solution = self.step(state, None if controls is None else controls[k])
+            states.append(state)
+            status.append(solution.status)
+            if progress is not None:
+                progress(k + 1)
+        v = [self.integrator.velocity(self.articulation, x, self.step_size) for x in states]
+        return Trajectory(torch.stack([x.q for x in states]), torch.stack(v), state, torch.stack(status))
+
+    def linearize(self, *_: Any, **__: Any) -> Linearization[S]:
+        """Raises `InputError`: a step that may be cut is differentiated as it is made, by `step`."""
+        raise InputError("an EventSimulator does not linearise its steps: differentiate `step`, or use a Simulator")
 
 
 NO_DERIVATIVES = "the steps of an AdaptiveSimulator carry no derivatives: detach what requires them, or use a Simulator"

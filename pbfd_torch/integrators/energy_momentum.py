@@ -48,6 +48,7 @@ FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
 NOISE = 1e-4  # of the same: less in one step is never refused
 PATIENCE, FAST = 3, 0.3  # halvings of steps in which a link turns by so much [rad]
+STILL = 0.01  # of the accuracy: where something presses, less is not worth an extrapolation
 RESERVE = 1e-2  # of the largest kinetic energy so far: what is kept of losses
 
 
@@ -193,13 +194,26 @@ class EnergyMomentum:
         fast = objective.turned(place(objective.articulation, end.q), FAST).any(-1)
         return torch.where(solved & self._overdrawn(end) & fast, PATIENCE, free.to(torch.int32))
 
-    def extrapolated(self, articulation: Articulation, whole: Velocities, middle: Velocities, end: Velocities) -> Velocities:
-        """See `Extrapolating`: (4 x(Δt/2) − x(Δt))/3, of fourth order."""
-        struck = torch.stack([(x.push != 0).any(-1) for x in (whole, middle, end)]).any(0)[..., None]
-        q = retract(articulation, end.q, difference(articulation, whole.q, end.q) / 3)
-        first, last = (x.v + 0.5 * x.lag for x in (whole, end))
-        v = end.v + (last - first) / 3
-        return replaced(end, q=torch.where(struck, end.q, q), v=torch.where(struck, end.v, v))
+    def extrapolated(
+        self,
+        articulation: Articulation,
+        start: Velocities,
+        whole: Velocities,
+        middle: Velocities,
+        end: Velocities,
+        off: Tensor,
+        accuracy: float,
+    ) -> Velocities:
+        """See `Extrapolating`: (4 x(Δt/2) − x(Δt))/3, of fourth order, and 2 x(Δt/2) − x(Δt), of second, where something has
+        pressed all along: what contacts give comes early by half a step. What lies still is damped best by the halves."""
+        pushed = torch.stack([(x.push != 0).any(-1) for x in (start, whole, middle, end)])[..., None]
+        pressed, struck = pushed.all(0), pushed[1:].any(0)
+        share = torch.where(pressed, 1.0, 1 / 3).to(end.v.dtype)
+        q = retract(articulation, end.q, share * difference(articulation, whole.q, end.q))
+        first, last = (x.v + 0.5 * (x.steady + x.lag) for x in (whole, end))
+        v = end.v + share * (last - first)
+        known = (off <= accuracy)[..., None] & ((pressed & (off > STILL * accuracy)[..., None]) | ~struck)
+        return replaced(end, q=torch.where(known, q, end.q), v=torch.where(known, v, end.v))
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""

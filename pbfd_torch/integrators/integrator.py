@@ -170,10 +170,11 @@ class Leaping(Protocol[S]):
 
 @runtime_checkable
 class Extrapolating(Protocol[S]):
-    """An integrator whose error has an even expansion in the step."""
+    """An integrator whose error has an expansion in the step."""
 
-    def extrapolated(self, articulation: Articulation, whole: S, middle: S, end: S) -> S:
-        """What the ends of a step and of its two halves say together; the halves' end where something has pushed."""
+    def extrapolated(self, articulation: Articulation, start: S, whole: S, middle: S, end: S, off: Tensor, accuracy: float) -> S:
+        """What the ends of a step from a state and of its two halves say together. The halves' end where something has struck, and
+        where they are further apart than the accuracy. off: how far, `[*batch]` [m]."""
         ...
 
 

@@ -25,6 +25,8 @@ from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.fitted import Fitted, stiffness
 from pbfd_torch.integrators.integrator import Leap, after
 from pbfd_torch.solvers.linear import solved_positive
+from pbfd_torch.tensors.worlds import replaced
+from pbfd_torch.terms.contact_laws import Prepared
 from pbfd_torch.terms.inertia import Inertia
 from pbfd_torch.terms.joint_dry_friction import JointDryFriction
 from pbfd_torch.terms.joint_springs import Armature
@@ -72,11 +74,12 @@ class RungeKutta(EnergyMomentum):
         flow = _Flow(terms, objective)
         h, start = step.dt[..., None], (state.q, self.velocity(a, state, step.dt))
         at, rates = start, [flow.rates(*start)]
-        off = touched = objective.push(state.q) > 0
+        solids = standing(objective)
+        off = touched = solids.push(state.q) > 0
         for row in STAGES:
             at = _moved(start, h, row, rates)
             rates.append(flow.rates(*at))
-            touched = touched | (objective.push(at[0]) > 0)
+            touched = touched | (solids.push(at[0]) > 0)
         q, v = a.topology.normalized(at[0]), at[1]
         short, slower = _moved((q, v), h, SHORT, rates)
         # what the velocity is off by shows in the next step
@@ -88,7 +91,7 @@ class RungeKutta(EnergyMomentum):
         good = able & (error <= self.trust * moved + least) & torch.isfinite(v).all(-1)
         strike = torch.ones_like(error)
         if bool((good & touched).any()):
-            found = first_strike(objective, h, (state.q, rates[0][0]), (at[0], rates[-1][0]))
+            found = first_strike(solids, h, (state.q, rates[0][0]), (at[0], rates[-1][0]))
             strike = torch.where(good & touched, found, strike)
         now = place(a, q)
         nothing = torch.zeros_like(v)
@@ -106,6 +109,12 @@ class RungeKutta(EnergyMomentum):
         )
         stages = 1 + len(STAGES)
         return Leap(end, good & ~touched, error, strike, stages * able.to(torch.int32), stages)
+
+
+def standing(objective: BalanceObjective) -> BalanceObjective:
+    """The same with all solids where they are, and not moved out to throw something back (`Restitution`)."""
+    prepared = [replaced(x, bounce=None) if isinstance(x, Prepared) else x for x in objective.prepared]
+    return replaced(objective, prepared=prepared)
 
 
 def first_strike(objective: BalanceObjective, h: Tensor, start: Pair, end: Pair) -> Tensor:

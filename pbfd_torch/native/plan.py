@@ -272,7 +272,7 @@ class _Terms:
         zero = torch.zeros(a.nv, dtype=a.dtype)
         self.spring = self.damping = self.armature = self.dry = self.limit = zero
         self.rest = a.rest
-        self.limit_release, self.limit_per_force, self.dry_speed = 1.0, 0.0, 1e-3
+        self.limit_release, self.limit_per_force, self.dry_speed = 0.1, 0.0, 1e-3
         self.actuators: Actuators | None = None
         self.drives: Actuators | None = None  # what presses on the limits
         self.pushed: list[int] = []  # nodes

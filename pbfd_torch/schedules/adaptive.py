@@ -1,7 +1,8 @@
 """Steps of their own for every world: a user asks for an accuracy, and each world finds the Δt that gives it.
 
 Every step is made twice, whole and as two halves; how far both end apart is the error estimate. What both say together is kept,
-which is of fourth order, or the halves where something has pushed. Explicit steps (`RungeKutta`) know their error without halves.
+which is of fourth order, or of second where something presses, or the halves where something has struck. Explicit steps
+(`RungeKutta`) know their error without halves.
 A world goes on with the step that its own error asks for and never waits for another one but at the ends of the frames, where its
 control changes and its state is recorded.
 """
@@ -135,7 +136,7 @@ class _Frame(Generic[S]):
         h, cuts = torch.minimum(h, worlds.rows(self._cut)), worlds.rows(self._cuts)
         held = None if self._control is None else worlds.pick(self._control, 1)
         may_cut = (cuts < CUTS, (left - REST * self._stepper.dt) / h)
-        tried = _tried(self._fixed.take(worlds), now, spacing, h, held, may_cut)
+        tried = _tried(self._fixed.take(worlds), now, spacing, h, held, may_cut, self._stepper.accuracy.length)
 
         accuracy, solution = self._stepper.accuracy, tried.solution
         broken = solution.status == int(Status.NON_FINITE)
@@ -214,10 +215,16 @@ class _Tried(Generic[S]):
 
 
 def _tried(
-    stepper: Stepper[S], state: S, spacing: Tensor, h: Tensor, control: Tensor | None, may_cut: tuple[Tensor, Tensor]
+    stepper: Stepper[S],
+    state: S,
+    spacing: Tensor,
+    h: Tensor,
+    control: Tensor | None,
+    may_cut: tuple[Tensor, Tensor],
+    accuracy: float,
 ) -> _Tried[S]:
     """A step of length h `[n]` from a state whose history is for steps of `spacing`. may_cut: whether it may be cut short where
-    something strikes, and the share of it where the latest cut may be, `[n]` each."""
+    something strikes, and the share of it where the latest cut may be, `[n]` each. accuracy: asked for [m]."""
     integrator, a = stepper.integrator, stepper.scene.articulation
     start = integrator.resized(a, state, spacing, h)
     coarse, first, _ = stepper.sized(h).made(start, control)
@@ -239,7 +246,7 @@ def _tried(
     rough = coarse.take(worlds)
     off = apart(a, rough.q, end.q)
     if isinstance(integrator, Extrapolating):
-        end = integrator.extrapolated(a, rough, middle, end)
+        end = integrator.extrapolated(a, before, rough, middle, end, off, accuracy)
     end = replaced(end, hazards=before.hazards | middle.hazards | end.hazards)
 
     def added(old: Tensor, one: Tensor, other: Tensor) -> Tensor:

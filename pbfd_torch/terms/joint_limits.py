@@ -16,13 +16,14 @@ from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.checks import require_positive
 from pbfd_torch.terms.load import JointLoad, StepContext, diagonal_load
 from pbfd_torch.terms.normal_force import NormalForce
-from pbfd_torch.terms.release import NormalLaw, require_release
+from pbfd_torch.terms.release import NormalLaw, Releasing, require_release
 from pbfd_torch.terms.scalar_coordinates import scalar_coordinates
 from pbfd_torch.tree.articulation import Articulation, force_scale, lever
 from pbfd_torch.tree.kinematics import Placement
 
 _LAW = NormalForce(1.0, exponent=2.0)
 TOO_FAR = 0.02  # [rad or m] past a limit: ten times what the weight brings about
+RETURN = 0.2  # [s]
 HELD = 4e-4  # [rad or m] past a limit under the largest force of the joint's actuators
 
 
@@ -39,12 +40,14 @@ class JointLimits:
     lets go of what leaves it (`Releasing`). Coordinates of ball and free joints have no limits.
 
     `stiffness`: k `[*, nv]` [N m/rad² or N/m²] > 0: a load τ rests √(τ/k) past the limit.
-    `release`: speed > 0 of leaving [rad/s or m/s] at which a limit pushes no more; infinite: never, and short steps bounce.
+    `release`: speed > 0 of leaving [rad/s or m/s] at which a limit pushes no more: what a strike leaves with, at most, however
+    short the steps. From far beyond it is faster, by x / .2 s, so a joint that starts there is back soon. Infinite: never, and
+    short steps bounce.
     `drives`: actuators without a largest force: in every step k is at least what holds them within `HELD`.
     `share`: k is multiplied by it."""
 
     stiffness: Tensor
-    release: float = 1.0
+    release: float = 0.1
     drives: Actuators | None = None
     share: float = 1.0
 
@@ -72,8 +75,10 @@ class JointLimits:
 
     def _laws(self, prepared: PreparedLimits) -> Sequence[NormalLaw]:
         """Below and above the range."""
-        law = replaced(_LAW, stiffness=prepared.stiffness * self.share, release=self.release)
-        return [law.during(start, prepared.dt) for start in prepared.starts or (None, None)]
+        law = replaced(_LAW, stiffness=prepared.stiffness * self.share)
+        if prepared.starts is None:
+            return [law, law]
+        return [Releasing(law, start, (self.release + start / RETURN) * prepared.dt) for start in prepared.starts]
 
     def prepare(self, step: StepContext) -> PreparedLimits:
         stiffness = self.stiffness

@@ -191,8 +191,8 @@ template <class V, class N, int D = 3> struct Balance {
   }
 
   // See `Contacts`.
-  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
-    contacts.each_normal_force(at, visit), meetings.each_normal_force(at, visit);
+  template <class F> void each_normal_force(Poses<V> at, F&& visit, bool raised = true) const {
+    contacts.each_normal_force(at, visit, raised), meetings.each_normal_force(at, visit, raised);
   }
 
   // What anchors remember of the start of the step; and at its end, where the nodes are now and the contacts have looked.

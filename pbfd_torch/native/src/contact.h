@@ -162,8 +162,8 @@ template <class V, class N, int D> struct Contacts {
   }
 
   // What the normal forces of the step's own problem are where nodes are at these poses, and what lagged friction feels there:
-  // visit(candidate, force, felt).
-  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
+  // visit(candidate, force, felt). raised: solids that throw candidates back are where the step has moved them.
+  template <class F> void each_normal_force(Poses<V> at, F&& visit, bool raised) const {
     each_kind(candidates, [&](auto pair, int first, int last) {
       for (int i = first; i < last; i++) {
         V c[D], push, rises;
@@ -174,7 +174,7 @@ template <class V, class N, int D> struct Contacts {
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * share[i];
         const Law<V>* law = laws.at(candidates.law[i]);
         V d = depth(pair, i, at, c, solid);
-        if (laws.throwing) firmness = harder(i, firmness), d += moved_out(i);
+        if (laws.throwing && raised) firmness = harder(i, firmness), d += moved_out(i);
         normal_force(law, firmness, d, start, per_dt * V(candidates.per_release[i]), push, rises);
         visit(i, push, law ? law->feels(push, d) : push);
       }

@@ -176,13 +176,14 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     for (int i = 0; i < plan.nv; i++) found = found | (abs(x.push[i]) > V(0));
     return found;
   }
-  V speed(const State& x, int i) const { return fma(V(0.5), x.lag[i], x.v[i]); }
+  V speed(const State& x, int i) const { return fma(V(0.5), x.steady[i] + x.lag[i], x.v[i]); }
 
-  // (4 x(Δt/2) − x(Δt))/3 of lanes at the end of two halves, where nothing has pushed.
-  void extrapolate(M which, const V* coarse, const V* coarse_speed, State& x) {
+  // (4 x(Δt/2) − x(Δt))/3 of lanes at the end of two halves, and 2 x(Δt/2) − x(Δt) where something has pressed.
+  void extrapolate(M which, M pressed, const V* coarse, const V* coarse_speed, State& x) {
     if (!any(which)) return;
-    for (int i = 0; i < plan.nv; i++) x.v[i] = select(which, x.v[i] + (speed(x, i) - coarse_speed[i]) / V(3), x.v[i]);
-    difference(plan, coarse, x.q, other), retract(plan, x.q, other, V(1) / V(3), room_to_begin);
+    const V share = select(pressed, V(1), V(1.0 / 3));
+    for (int i = 0; i < plan.nv; i++) x.v[i] = select(which, fma(share, speed(x, i) - coarse_speed[i], x.v[i]), x.v[i]);
+    difference(plan, coarse, x.q, other), retract(plan, x.q, other, share, room_to_begin);
     for (int i = 0; i < plan.nq; i++) x.q[i] = select(which, room_to_begin[i], x.q[i]);
   }
 

@@ -13,6 +13,7 @@ enum Half { WHOLE, FIRST_HALF, SECOND_HALF, AT_ONCE };
 
 constexpr double BRINK = 1e-6, REST = 1e-4;  // of the step, before a strike; of the frame, after it: less is not worth a step
 constexpr int CUTS = 5;
+constexpr double STILL = 0.01;  // of the accuracy: where something presses, less is not worth an extrapolation
 
 // How far a lane is in a frame [s], and what that has cost.
 template <class T> struct Frame : Tally<T> {

@@ -109,10 +109,11 @@ inline void joint_loads(const Plan<N, D>& plan, const JointStep<V>& step, const 
       const V under = V(plan.lower[i]) - x, over = x - V(plan.upper[i]);
       if ((LOADS & LIMITS) && any((under > zero) | (over > zero))) {
         V push, rises;
-        const V per_range = V(1) / (V(plan.limit_release[0]) * step.dt), stiffness = step.relaxed.firmness * step.limits[i];
-        release_law(stiffness, under, max(V(plan.lower[i]) - step.start[c], zero), per_range, push, rises);
+        const V release(plan.limit_release[0]), stiffness = step.relaxed.firmness * step.limits[i];
+        const V below = max(V(plan.lower[i]) - step.start[c], zero), above = max(step.start[c] - V(plan.upper[i]), zero);
+        release_law(stiffness, under, below, per_return(release, below, step.dt), push, rises);
         r -= push, slope += rises;
-        release_law(stiffness, over, max(step.start[c] - V(plan.upper[i]), zero), per_range, push, rises);
+        release_law(stiffness, over, above, per_return(release, above, step.dt), push, rises);
         r += push, slope += rises;
       }
       residual[i] += r, slopes[i] += slope;

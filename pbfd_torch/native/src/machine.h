@@ -48,7 +48,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (first == last) return;
     journey = &to, rules = asked, next = first, end = last;
     scheme.ask(rules);
-    newton.running = eased = anew = leapt = cut = struck = M(false), stiffest = estimate = V(0), strike = V(1);
+    newton.running = eased = anew = leapt = cut = struck = pressed = M(false), stiffest = estimate = V(0), strike = V(1);
     M fresh(false);
     for (int i = 0; i < W; i++) plainly[i] = false, put(fresh, i, board(i));
     if (paced()) set_base(fresh);
@@ -78,6 +78,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
   M leapt;          // it has made one
   M cut;            // which is to be made again, to where something strikes
   M struck;         // something has pushed in its step of a frame
+  M pressed;        // something has pushed before it, and in all that was made of it
   M safe, from_guess, from_start;  // where it sets out: with a retreat; from the guess, from θ_n, else from where it is
 
   bool any_aboard() const {
@@ -338,7 +339,9 @@ template <class V, class N, int D, class Scheme> struct Machine {
     }
     for (int i = 0; i < plan.nq; i++) coarse[i] = select(whole_step, after.q[i], coarse[i]);
     if constexpr (Scheme::extrapolates) {
-      struck = (struck & !whole_step) | (ends & scheme.pushed(after));
+      const M pushed = scheme.pushed(after);
+      struck = (struck & !whole_step) | (ends & pushed);
+      pressed = ((pressed & !whole_step) | (whole_step & scheme.pushed(base))) & (pushed | !ends);
       for (int i = 0; i < plan.nv; i++) coarse_speed[i] = select(whole_step, scheme.speed(after, i), coarse_speed[i]);
     }
     copy(plan, half, after, middle), copy(plan, half, after, before);
@@ -346,7 +349,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (any(judged)) {
       place(plan, coarse, reached[0], axes), place(plan, after.q, reached[1], axes);
       off = select(at_once, estimate, apart(plan, reached[0], reached[1]));
-      if constexpr (Scheme::extrapolates) scheme.extrapolate(judged & !at_once & !struck, coarse, coarse_speed, after);
+      if constexpr (Scheme::extrapolates) scheme.extrapolate(agreed(judged & !at_once, off), pressed, coarse, coarse_speed, after);
     }
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i) || lane(cut, i)) continue;
@@ -372,6 +375,11 @@ template <class V, class N, int D, class Scheme> struct Machine {
   void set_base(M begin) {
     copy(plan, begin, before, base);
     scheme.resize(begin, lengths(), whole, before);
+  }
+  // Where a whole step and its halves say the same, and nothing has struck in between; what lies still is damped best by the halves.
+  M agreed(M which, V off) const {
+    const V most = V(T(rules.accuracy));
+    return which & (off <= most) & ((pressed & (off > V(T(STILL)) * most)) | !struck);
   }
   V spacing() const { return of_frames([](const Frame<T>& x) { return x.spacing; }); }
   V lengths() const { return of_frames([](const Frame<T>& x) { return x.length; }); }

@@ -113,15 +113,15 @@ template <class V, class N, int D> struct Meetings {
   }
 
   // See `Contacts`.
-  template <class F> void each_normal_force(Poses<V> at, F&& visit) const {
+  template <class F> void each_normal_force(Poses<V> at, F&& visit, bool raised) const {
     if constexpr (D == 3) slots.each_row([&](auto pair, int r) {
       each_spot(r, [&](Spot<V>& s, int held) {
         V c[3], push, rises, firmness = V(slots.laws(r)[0]);
         Beside<V, 3> solid;
         const Law<V>* law = laws.at(bodies.law[r]);
         if constexpr (decltype(pair)::Support::wanders) firmness = firmness * s.share;
-        const V d = depth(pair, r, s, at, c, solid) + s.bounce;
-        normal_force(law, law ? law->harder(firmness, s.bounce) : firmness, d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
+        const V bounce = raised ? s.bounce : V(0), d = depth(pair, r, s, at, c, solid) + bounce;
+        normal_force(law, law ? law->harder(firmness, bounce) : firmness, d, s.began, per_dt * V(slots.laws(r)[3]), push, rises);
         visit(held, push, law ? law->feels(push, d) : push);
       });
     });

@@ -23,7 +23,7 @@ template <class V, class N, int D = 3> struct Outlook {
   V *twist, *drift;  // [6] per node
   int count = 0, limits = 0;
   V base, slope;  // of what changes linearly
-  V per_limit_range;
+  V limit_release, dt;
   double close;  // which part of the work may be left: where bodies couple, evaluations cost much more than looking well
   const Relaxed<V>* relaxed;
   const Law<V>* laws;
@@ -42,7 +42,7 @@ template <class V, class N, int D = 3> struct Outlook {
     const Plan<N, D>& plan = b.plan;
     const V zero(0);
     count = limits = 0, base = slope = zero;
-    per_limit_range = V(1) / (V(plan.limit_release[0]) * b.dt), relaxed = &b.relaxed, laws = b.laws.law;
+    limit_release = V(plan.limit_release[0]), dt = b.dt, relaxed = &b.relaxed, laws = b.laws.law;
     twists(plan, b.axes, d, twist);
     drifts(plan, b.axes, twist, d, drift);
     each_kind(plan.contact, [&](auto pair, int first, int last) {
@@ -218,7 +218,7 @@ template <class V, class N, int D = 3> struct Outlook {
 
   V of_limit(const Stop<V>& s, V a, V& df) const {
     V push, rises;
-    release_law(s.stiffness, fma(a, s.speed, s.past), s.start, per_limit_range, push, rises);
+    release_law(s.stiffness, fma(a, s.speed, s.past), s.start, per_return(limit_release, s.start, dt), push, rises);
     df = rises * s.speed * s.speed;
     return push * s.speed;
   }

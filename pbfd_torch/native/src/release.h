@@ -10,6 +10,10 @@ template <class V> inline void released(V depth, V start, V per_range, V& share,
   share = x * x * fma(V(-2), x, V(3)), rises = V(6) * x * (V(1) - x) * per_range;
 }
 
+// 1 / (v Δt) of a limit: the deeper it is left from, the faster.
+constexpr double RETURN = 0.2;  // [s]
+template <class V> inline V per_return(V release, V start, V dt) { return V(1) / (fma(start, V(1 / RETURN), release) * dt); }
+
 // N and dN/dd.
 template <class V> inline void release_law(V stiffness, V depth, V start, V per_range, V& push, V& slope) {
   V share, falls;

@@ -49,7 +49,7 @@ template <class V, class N, int D = 3> struct Leap {
   M make(const Balance<V, N, D>& b, Sight<V, N, D>& sight, M which, const V* from_q, const V* from_v, V stiffest, T trust) {
     tried = which & (stiffest <= V(T(STIFFEST))), strike = V(1), error = V(0);
     for (int i = 0; i < plan.nv; i++) tried = tried & !(V(plan.dry[i]) > V(0));
-    if (any(tried)) tried = tried & !sight.pushes(b, from_q);
+    if (any(tried)) tried = tried & !sight.pushes(b, from_q, false);
     if (!any(tried)) return tried;
     const V h = b.dt;
     M clear(true);  // nothing pushes at any of the stages
@@ -57,7 +57,7 @@ template <class V, class N, int D = 3> struct Leap {
       blend(from_q, h, s ? STAGE[s - 1] : nullptr, s, moves, plan.nq, q);
       blend(from_v, h, s ? STAGE[s - 1] : nullptr, s, gains, plan.nv, v);
       normalize(plan, q, at);
-      if (s > 0) clear = clear & !sight.pushes(b, at);
+      if (s > 0) clear = clear & !sight.pushes(b, at, false);
       coordinate_rates(plan, q, v, moves[s]);
       flow.accelerate(sight.there, sight.axes, at, v, b.control, gains[s]);
     }
@@ -95,7 +95,7 @@ template <class V, class N, int D = 3> struct Leap {
         at[i] = fma(h * x * y, fma(y, moves[0][i], -(x * moves[STAGES - 1][i])), ends);
       }
       normalize(plan, at, at);
-      return sight.pushes(b, at);
+      return sight.pushes(b, at, false);
     };
     V low(0), high(2);  // the strike is between them
     for (int k = 1; k <= SCANS; k++) {

@@ -22,11 +22,11 @@ template <class V, class N, int D> struct Sight {
 
   void look(const V* q) { place(plan, q, there, axes); }
 
-  // Whether contacts or limits push at the end of a step at q.
-  M pushes(const Balance<V, N, D>& b, const V* q) {
+  // Whether contacts or limits push at the end of a step at q; raised: see `Contacts`.
+  M pushes(const Balance<V, N, D>& b, const V* q, bool raised = true) {
     look(q);
     M found(false);
-    b.each_normal_force(there, [&](int, V force, V) { found = found | (force > V(0)); });
+    b.each_normal_force(there, [&](int, V force, V) { found = found | (force > V(0)); }, raised);
     forces_of<LIMITS>(b, q, turned, slopes);
     for (int i = 0; i < plan.nv; i++) found = found | (abs(turned[i]) > V(0));
     return found;

@@ -1,0 +1,207 @@
+"""Steps of one length that are cut where something strikes: each is made up to there, and from there on.
+
+A step that ends long after an impact within it knows neither when that was nor what a change of the start does to it: its
+derivatives, though exact, are those of a bounce at the step's end (docs/GRADIENTS.md). Cut at the instant τ at which something
+first touches on the way of an explicit step (`RungeKutta`), its end depends on the start through τ as well: dτ = −dg/ġ, g how
+hard it touches a little later.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Generic, Self
+
+import torch
+from torch import Tensor
+
+from pbfd_torch.balance.objective import BalanceObjective
+from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.runge_kutta import standing
+from pbfd_torch.scene import Scene
+from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
+from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.stepper import Solver, Stepper
+from pbfd_torch.stepping.way import Way
+from pbfd_torch.stepping.worlds import put
+from pbfd_torch.tensors.worlds import Worlds, replaced
+from pbfd_torch.tree.kinematics import retract
+
+Make = Callable[[EagerStepper[Any], Any, Tensor | None], tuple[Any, Solution]]
+"""Makes a step of a stepper from a state under a control: where it ends, and how it was solved."""
+LATER = (1e-6, 1e-5, 1e-4, 1e-3)  # of the step, after the instant: when it is felt how hard something touches
+
+
+def made_with_events(
+    make: Make, stepper: EagerStepper[S], state: S, control: Tensor | None, cuts: int = CUTS
+) -> tuple[S, Solution]:
+    """The step, in worlds in which something strikes up to there and on from there, with so many cuts at most. It carries the
+    derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that was tried has
+    cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it."""
+    end, solution = make(stepper, state, control)
+    solution = replaced(solution, steps=torch.ones_like(solution.status))
+    if cuts == 0 or solution.strike is None:
+        return end, solution
+    size = stepper.step_size.detach().expand(solution.strike.shape)
+    apart = (solution.strike > BRINK) & ((1 - solution.strike) * size >= REST * stepper.dt)
+    index = ((solution.strike < 1) & apart).reshape(-1).nonzero().squeeze(-1)
+    if len(index) == 0:
+        return end, solution
+    worlds, everywhere = Worlds(tuple(solution.strike.shape), index), torch.ones_like(index, dtype=torch.bool)
+    part, before, held = stepper.take(worlds), state.take(worlds), None if control is None else worlds.pick(control, 1)
+    whole = part.step_size.expand(index.shape)
+    at, touch, found = _at_strike(make, part, before, held, worlds.rows(solution.strike) * whole.detach(), whole)
+    rest = part.sized(whole - at)
+    after, last = made_with_events(
+        make, rest, part.integrator.resized(part.articulation, touch, at, rest.step_size), held, cuts - 1
+    )
+    after = part.integrator.resized(part.articulation, after, rest.step_size, whole)
+    after = replaced(after, hazards=touch.hazards | after.hazards)
+    return put(end, after, worlds, everywhere), _joined(solution, worlds, (found, last))
+
+
+def _at_strike(
+    make: Make, stepper: EagerStepper[S], state: S, control: Tensor | None, at: Tensor, whole: Tensor
+) -> tuple[Tensor, S, Solution]:
+    """When something strikes after a state [s] `[n]`, about at `at`, the state there, and how it was made; whole: the step [s]
+    `[n]` that the state's history is for."""
+    a, integrator = stepper.articulation, stepper.integrator
+
+    def reached(time: Tensor) -> tuple[S, Solution]:
+        return make(stepper.sized(time), integrator.resized(a, state, whole, time), control)
+
+    end, solution = reached(at)
+    spent = solution.evaluations
+    for _ in range(CUTS):  # the way there is known better from nearby
+        strike = solution.strike
+        if strike is None or not bool((early := (strike < 1) & (strike > BRINK)).any()):
+            break
+        at = torch.where(early, strike * at, at)
+        end, solution = reached(at)
+        spent = spent + solution.evaluations
+    if end.q.requires_grad:
+        at = at + _shift(stepper.sized(at), end, control, at)
+        end, solution = reached(at)
+    return at, end, replaced(solution, evaluations=spent, steps=torch.ones_like(solution.status))
+
+
+def _shift(stepper: EagerStepper[S], end: S, control: Tensor | None, at: Tensor) -> Tensor:
+    """How much later something strikes as the end of a step does up to there changes: zero `[n]` [s], with its derivatives; without
+    any where nothing touches soon."""
+    a = stepper.articulation
+    plain = replaced(end, **{f.name: _still(getattr(end, f.name)) for f in dataclasses.fields(end)})
+    v = stepper.integrator.velocity(a, plain, at)
+    objective = standing(stepper.objective(plain, control))
+    found = torch.zeros_like(at)
+    for share in LATER:
+        passed = (share * at).requires_grad_()
+        with torch.enable_grad():
+            faster = objective.push(retract(a, plain.q, passed[..., None] * v))
+            (rate,) = torch.autograd.grad(faster.sum(), passed)
+        felt = objective.push(retract(a, end.q, share * at[..., None] * v))
+        feels = (felt.detach() > 0) & (rate > 0) & (found == 0)
+        shift = (felt.detach() - felt) / torch.where(feels, rate, torch.ones_like(rate))
+        found = torch.where(feels, shift, found)
+        if bool((felt > 0).all()):
+            break
+    return found
+
+
+def _still(x: Any) -> Any:
+    """A field of a state without derivatives."""
+    if isinstance(x, tuple):
+        return tuple(map(_still, x))
+    return x.detach() if isinstance(x, Tensor) else x
+
+
+def _joined(whole: Solution, worlds: Worlds, parts: tuple[Solution, Solution]) -> Solution:
+    """How steps were solved, those of some worlds in two parts."""
+    everywhere = torch.ones_like(worlds.index, dtype=torch.bool)
+    first, last = parts
+
+    def worst(name: str) -> Tensor:
+        return put(getattr(whole, name), torch.maximum(getattr(first, name), getattr(last, name)), worlds, everywhere)
+
+    def added(name: str) -> Tensor:
+        old = getattr(whole, name)
+        return put(old, worlds.rows(old) + getattr(first, name) + getattr(last, name), worlds, everywhere)
+
+    assert whole.steps is not None
+    assert first.steps is not None
+    assert last.steps is not None
+    return replaced(
+        whole,
+        q=put(whole.q, last.q, worlds, everywhere),
+        status=worst("status"),
+        residual_norm=worst("residual_norm"),
+        iterations=added("iterations"),
+        evaluations=added("evaluations"),
+        fallbacks=added("fallbacks"),
+        steps=put(whole.steps, first.steps + last.steps, worlds, everywhere),
+        lanes=whole.lanes + first.lanes + last.lanes,
+    )
+
+
+class EventStepper(Generic[S]):
+    """A `Stepper` whose steps are cut where something strikes. `eager`: their definition; `engine`: makes the steps of such."""
+
+    def __init__(self, eager: EagerStepper[S], engine: Callable[[EagerStepper[Any]], Stepper[Any]]) -> None:
+        self.eager, self.engine = eager, engine
+
+    @property
+    def scene(self) -> Scene:
+        return self.eager.scene
+
+    @property
+    def integrator(self) -> Integrator[S]:
+        return self.eager.integrator
+
+    @property
+    def step_size(self) -> Tensor:
+        """Of a step that is not cut."""
+        return self.eager.step_size
+
+    @property
+    def dt(self) -> float:
+        return self.eager.dt
+
+    @property
+    def solver(self) -> Solver:
+        return self.eager.solver
+
+    @property
+    def halvings(self) -> int:
+        return self.eager.halvings
+
+    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
+        """See `Stepper`."""
+        return self.engine(self.eager).initial_state(q, v, control)
+
+    def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
+        """See `Stepper`. Its way has the balance of the whole step and no way back: derivatives go through its parts."""
+
+        def make(stepper: EagerStepper[Any], start: Any, held: Tensor | None) -> tuple[Any, Solution]:
+            return self.engine(stepper).made(start, held)[:2]
+
+        with torch.no_grad():
+            end, solution = made_with_events(make, self.eager, state, control)
+        return end, solution, Way(end.q, (), self.objective(state, control))
+
+    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
+        """See `Stepper`: of the whole step."""
+        return self.eager.objective(state, control)
+
+    def take(self, worlds: Worlds) -> Self:
+        """See `Stepper`."""
+        return self._of(self.eager.take(worlds))
+
+    def sized(self, step_size: Tensor) -> Self:
+        """See `Stepper`."""
+        return self._of(self.eager.sized(step_size))
+
+    def _of(self, eager: EagerStepper[S]) -> Self:
+        other = copy.copy(self)
+        other.eager = eager
+        return other
