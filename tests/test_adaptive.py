@@ -9,6 +9,7 @@ import torch
 
 from pbfd_torch import EnergyMomentum, ImplicitEuler, InputError, RungeKutta, Simulator, Status
 from pbfd_torch.balance.dynamics import apart
+from pbfd_torch.bench.precision_scenes import CASES
 from pbfd_torch.contact.shapes import Sphere
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.models import SCENES
@@ -167,3 +168,21 @@ def test_a_rebound_survives_a_tight_accuracy(scheme: EnergyMomentum, accuracy: f
     expected = gravity * fall * (0.7 - fall) - 0.5 * gravity * (0.7 - fall) ** 2
     assert float(rollout.q[-1, 2]) - 0.05 == pytest.approx(expected, rel=0.07)
     assert float(rollout.energy[-1]) == pytest.approx(float(rollout.energy[0]), rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "most"), [("hopper", (6e-3, 6e-4, 6e-4, 3e-4)), ("walker", (0.1, 2e-2, 4e-3, 2e-3))])
+def test_robots_converge_through_impacts(name: str, most: tuple[float, ...]) -> None:
+    """Feet and limits strike: a tenth of the accuracy brings the root of a robot closer to where steps of 1e-8 m lead, for half a
+    second; after that an early difference is multiplied by what follows."""
+    case = CASES[name]
+    ends = []
+    for accuracy in (1e-3, 1e-4, 1e-5, 1e-6, 1e-8):
+        setup = case.setup(1)
+        simulator = AdaptiveSimulator(setup.scene, 0.1, accuracy, shortest=2e-5)
+        controls = case.controls(0.1, 0.1 * torch.arange(5, dtype=torch.float64)[:, None])
+        rollout = simulator.rollout(simulator.initial_state(setup.q, setup.v), controls)
+        assert bool(rollout.solved.all())
+        ends.append(rollout.link_poses[1:, 0, 0, :, 3])
+    errors = [float((x - ends[-1]).norm(dim=-1).square().mean().sqrt()) for x in ends[:-1]]
+    assert all(error < limit for error, limit in zip(errors, most, strict=True)), errors
+    assert errors[-1] < 0.1 * errors[0]

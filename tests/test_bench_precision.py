@@ -239,7 +239,7 @@ class Ran(Printed):
 def call(folder: Path, *arguments: object) -> Ran:
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        effort = replace(precision.QUICK, steps=(0.05, 0.1), worlds=3, seconds=(0.01, 0.01), own_step=0.02)
+        effort = replace(precision.QUICK, steps=(0.05, 0.1), worlds=3, seconds=(0.01, 0.01), own_accuracy=1e-3)
         patch.setattr(precision, "QUICK", effort)
         status = called(patch, "bench", "precision", "--quick", "--out", folder, *arguments)
     return Ran(status, out.getvalue(), err.getvalue(), folder)

@@ -27,7 +27,7 @@ from tests.states import implicit
 
 STEP, STEPS = 0.008, 250
 ROBOTS = ["hopper", "walker2d", "walker2d_v5", "ant", "half_cheetah", "humanoid"]
-# [s]; the ant starts .52 rad outside, the humanoid .03, and limits let go at 1 rad/s; the others are inside from the start
+# [s]; the ant starts .52 rad outside, the humanoid .03, and limits bring joints back; the others are inside from the start
 IN_LIMITS_FROM = {"ant": 0.75, "humanoid": 0.5}
 pytestmark = pytest.mark.filterwarnings("ignore::pbfd_torch.errors.NotModelledWarning", "ignore:compiler attribute")
 

@@ -27,10 +27,12 @@ from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
 from pbfd_torch.scene import Scene
 from pbfd_torch.simulator import AdaptiveSimulator, Simulator
+from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import FALLBACKS
 
 OURS, PEER = "pbfd_torch", "MuJoCo"
 ADAPTIVE = {"energy-momentum": "adaptive", "runge-kutta": "adaptive runge-kutta"}  # what rows are called
+FINELY, SHORTEST = 1e-12, 2e-5  # tolerance and step [s] of what serves as a reference
 OWN, OWN_PEER = "runge-kutta", "RK4"  # the integrators that are references, each of its own simulator
 MOST_CALLS = 100  # of the core, to take the shortest
 SLOW = 4.0  # a first step that takes this many times the time for all of them is taken for the rest
@@ -50,8 +52,9 @@ NOTES = (
         "files have them"
     ),
     (
-        f"where the reference is each simulator's own, contact models differ and so do the motions: ours is {OWN}, MuJoCo's is "
-        f"{OWN_PEER}; ±: by how much it still changed as its step was halved, and no error below that counts"
+        f"where the reference is each simulator's own, contact models differ and so do the motions: ours has steps of their own "
+        f"choice by {OWN}, MuJoCo's is {OWN_PEER}; ±: by how much it still changed with a tenth of the accuracy or half the step, "
+        "and no error below that counts"
     ),
     "diverged: MuJoCo found a bad state, or ours is not finite; unsolved: steps that ours left without a root",
     "an error counts as reached where all steps are solved and the energy rises by no more than .1 of the largest kinetic energy",
@@ -64,7 +67,7 @@ class Effort:
 
     Attributes:
         steps, peer_steps: time steps [s], ours and MuJoCo's.
-        own_step, own_peer_step: [s] of the motions that serve as references where there is no exact one.
+        own_accuracy, own_peer_step: [m] and [s] of the motions that serve as references where there is no exact one.
         worlds: of the batch, beside a single world.
         seconds: spent on the time of a single world and of a batch.
         pieces: of the motion, that a single world is timed over; a batch is timed over as much, all at once.
@@ -75,7 +78,7 @@ class Effort:
 
     steps: tuple[float, ...] = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
     peer_steps: tuple[float, ...] = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
-    own_step: float = 0.0005
+    own_accuracy: float = 1e-9
     own_peer_step: float = 0.0001
     worlds: int = 256
     seconds: tuple[float, float] = (0.4, 0.6)
@@ -99,7 +102,7 @@ class Effort:
 
 
 FULL = Effort()
-QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 0.005, 0.0005, 8, (0.1, 0.1), 1, 1, ("chain-fixed", "box-slide"), (1e-2, 1e-3))
+QUICK = Effort((0.01, 0.02), (0.002, 0.01, 0.05), 1e-6, 0.0005, 8, (0.1, 0.1), 1, 1, ("chain-fixed", "box-slide"), (1e-2, 1e-3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,7 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """What should be observed; `uncertainty`: by how much it changed as its step was halved, 0 where it is exact."""
+    """What should be observed; `uncertainty`: by how much it still changed as it was made finer, 0 where it is exact."""
 
     value: Tensor
     uncertainty: float = 0.0
@@ -136,6 +139,16 @@ def our_motion(case: Case, integrator: str, dt: float, duration: float, engine: 
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
     rollout = simulator.rollout(start, controls, steps if controls is None else None)
     return Motion(integrator, dt, Track.of_rollout(setup, rollout), rollout, simulator.engine)
+
+
+def adaptive_motion(case: Case, make: Callable[[Scene], Simulator[State]], duration: float) -> tuple[Track, Rollout, str]:
+    """The same in frames of steps of the worlds' own choice, and the engine that made them."""
+    setup = case.setup(case.tracked_worlds)
+    simulator, frames = make(setup.scene), step_count(duration, FRAME)
+    controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
+    start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
+    rollout = simulator.rollout(start, controls, frames if controls is None else None)
+    return Track.of_rollout(setup, rollout), rollout, simulator.engine
 
 
 def peer_motion(case: Case, integrator: str, dt: float, duration: float, repeats: int = 1) -> tuple[Track, float, bool]:
@@ -213,9 +226,21 @@ def reference_of(case: Case, integrator: str, dt: float, motion: Callable[[float
     return Reference(value, case.error(motion(2 * dt, until), value), f"{integrator} at {dt:g} s")
 
 
-def our_reference(case: Case, dt: float, engine: Engine | None = None) -> Reference:
-    """The default integrator's at dt."""
-    return reference_of(case, OWN, dt, lambda step, until: our_motion(case, OWN, step, until, engine).track)
+def our_reference(case: Case, accuracy: float, engine: Engine | None = None) -> Reference:
+    """What steps of an accuracy [m] of their own choice, 20 μs at least, give, solved to 1e-12, and how far that is from what ten
+    times the accuracy gives; exact where that is known."""
+    if case.exact is not None:
+        return Reference(case.exact())
+    until = min(case.duration, case.observed_s)
+
+    def motion(length: float) -> Track:
+        def make(scene: Scene) -> Simulator[State]:
+            return AdaptiveSimulator(scene, FRAME, length, INTEGRATORS[OWN](), Fallbacks.within(FINELY), SHORTEST, engine)
+
+        return adaptive_motion(case, make, until)[0]
+
+    value = case.observe(motion(accuracy))
+    return Reference(value, case.error(motion(10 * accuracy), value), f"steps of {accuracy:g} m by {OWN}")
 
 
 def peer_reference(case: Case, dt: float) -> Reference:
@@ -246,22 +271,17 @@ def adaptive_row(
     case: Case, integrator: str, accuracy: float, reference: Reference, effort: Effort, engine: Engine | None = None
 ) -> dict[str, Any]:
     """One run with steps of the worlds' own."""
-    setup = case.setup(case.tracked_worlds)
 
     def made(scene: Scene) -> Simulator[State]:
         return AdaptiveSimulator(scene, FRAME, accuracy, INTEGRATORS[integrator](), engine=engine)
 
-    simulator, frames = made(setup.scene), step_count(case.duration, FRAME)
-    controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
-    start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
-    rollout = simulator.rollout(start, controls, frames if controls is None else None)
-    track = Track.of_rollout(setup, rollout)
+    track, rollout, name = adaptive_motion(case, made, case.duration)
     steps = int(rollout.substeps.sum())
     return {
         **_ours(case, track, rollout, reference),
-        "engine": simulator.engine,
+        "engine": name,
         "integrator": ADAPTIVE[integrator],
-        "dt": case.duration * setup.worlds / steps,
+        "dt": case.duration * case.tracked_worlds / steps,
         "accuracy_m": accuracy,
         "world_steps": steps,
         "ms_per_s": _costs(case, track, made, effort),
@@ -312,7 +332,7 @@ def measure_scene(
         for dt in effort.steps_of(case):
             motions.append(our_motion(case, name, dt, case.duration, engine))
             progress(1)
-    reference = our_reference(case, effort.own_step, engine)
+    reference = our_reference(case, effort.own_accuracy, engine)
     other = peer_reference(case, effort.own_peer_step) if peers else None
     rows = []
     for motion in motions:
