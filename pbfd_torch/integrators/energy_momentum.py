@@ -26,6 +26,7 @@ from pbfd_torch.balance.dynamics import (
     armature_diagonal,
     generalised_momentum,
     kinetic_energy,
+    mass_matrix,
     mass_matrix_at,
     potential_energy,
     rotor_energy,
@@ -34,7 +35,7 @@ from pbfd_torch.balance.objective import BalanceObjective
 from pbfd_torch.errors import InputError
 from pbfd_torch.integrators.fitted import Fitted, fitted
 from pbfd_torch.integrators.implicit_euler import fallen
-from pbfd_torch.integrators.integrator import Integrator, Refusal, Starter, State, after, calm, fall, fresh
+from pbfd_torch.integrators.integrator import Halved, Integrator, Refusal, Starter, State, after, calm, fall, fresh
 from pbfd_torch.solvers.linear import solved_positive
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.inertia import Inertia
@@ -48,6 +49,7 @@ FARTHEST = 2.0  # [rad] that a joint may turn by in a step
 EXCESS = 1e-2  # of the kinetic energies, that of a fall over one step included: what one step may gain
 NOISE = 1e-4  # of the same: less in one step is never refused
 PATIENCE, FAST = 3, 0.3  # halvings of steps in which a link turns by so much [rad]
+SMOOTH_GAIN = 0.25  # of what a step gains of velocity: where halving it changes more, something strikes within
 STILL = 0.01  # of the accuracy: where something presses, less is not worth an extrapolation
 RESERVE = 1e-2  # of the largest kinetic energy so far: what is kept of losses
 
@@ -194,26 +196,26 @@ class EnergyMomentum:
         fast = objective.turned(place(objective.articulation, end.q), FAST).any(-1)
         return torch.where(solved & self._overdrawn(end) & fast, PATIENCE, free.to(torch.int32))
 
-    def extrapolated(
-        self,
-        articulation: Articulation,
-        start: Velocities,
-        whole: Velocities,
-        middle: Velocities,
-        end: Velocities,
-        off: Tensor,
-        accuracy: float,
-    ) -> Velocities:
+    def extrapolated(self, articulation: Articulation, terms: Sequence[Term], made: Halved[Velocities]) -> Velocities:
         """See `Extrapolating`: (4 x(Δt/2) − x(Δt))/3, of fourth order, and 2 x(Δt/2) − x(Δt), of second, where something has
-        pressed all along: what contacts give comes early by half a step. What lies still is damped best by the halves."""
-        pushed = torch.stack([(x.push != 0).any(-1) for x in (start, whole, middle, end)])[..., None]
+        pressed all along: what contacts give comes early by half a step. Of configurations and momenta, so that what is kept of
+        these is kept. What lies still is damped best by the halves."""
+        start, whole, end = made.start, made.whole, made.end
+        pushed = torch.stack([(x.push != 0).any(-1) for x in (start, whole, made.middle, end)])
         pressed, struck = pushed.all(0), pushed[1:].any(0)
-        share = torch.where(pressed, 1.0, 1 / 3).to(end.v.dtype)
+        begin, first, last = (x.v + 0.5 * (x.steady + x.lag) for x in (start, whole, end))
+        inertia = mass_matrix(articulation, end.q, terms)
+        changed, gained = (((inertia * x[..., None, :]).sum(-1) * x).sum(-1) for x in (last - first, last - begin))
+        smooth = pressed & (changed <= SMOOTH_GAIN**2 * gained) & (made.off > STILL * made.accuracy)
+        known = ((made.off <= made.accuracy) & (smooth | ~struck))[..., None]
+        share = torch.where(pressed, 1.0, 1 / 3).to(end.v.dtype)[..., None]
         q = retract(articulation, end.q, share * difference(articulation, whole.q, end.q))
-        first, last = (x.v + 0.5 * (x.steady + x.lag) for x in (whole, end))
-        v = end.v + share * (last - first)
-        known = (off <= accuracy)[..., None] & ((pressed & (off > STILL * accuracy)[..., None]) | ~struck)
-        return replaced(end, q=torch.where(known, q, end.q), v=torch.where(known, v, end.v))
+        coarse = (mass_matrix(articulation, whole.q, terms) * first[..., None, :]).sum(-1)
+        momenta = [(inertia * x[..., None, :]).sum(-1) for x in (last, end.push, end.steady, end.lag)]
+        momenta[0] = momenta[0] + share * (momenta[0] - coarse)
+        v, push, steady, lag = _solved(mass_matrix(articulation, q, terms), *momenta)
+        changes = {"q": q, "v": v - 0.5 * (steady + lag), "push": push, "steady": steady, "lag": lag}
+        return replaced(end, **{name: torch.where(known, x, getattr(end, name)) for name, x in changes.items()})
 
     def resized(self, articulation: Articulation, state: Velocities, dt: Tensor, new: Tensor) -> Velocities:
         """See `Integrator`."""

@@ -168,13 +168,30 @@ class Leaping(Protocol[S]):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Halved(Generic[S]):
+    """A step that was made twice.
+
+    Attributes:
+        start: the state before it. whole: the state after it. middle, end: after its first half, and after both.
+        off: how far `whole` and `end` are apart `[*batch]` [m]. accuracy: asked for [m].
+    """
+
+    start: S
+    whole: S
+    middle: S
+    end: S
+    off: Tensor
+    accuracy: float
+
+
 @runtime_checkable
 class Extrapolating(Protocol[S]):
     """An integrator whose error has an expansion in the step."""
 
-    def extrapolated(self, articulation: Articulation, start: S, whole: S, middle: S, end: S, off: Tensor, accuracy: float) -> S:
-        """What the ends of a step from a state and of its two halves say together. The halves' end where something has struck, and
-        where they are further apart than the accuracy. off: how far, `[*batch]` [m]."""
+    def extrapolated(self, articulation: Articulation, terms: Sequence[Term], made: Halved[S]) -> S:
+        """What the ends of a step and of its two halves say together. The halves' end where something has struck, and where they
+        are further apart than the accuracy. terms: of the scene."""
         ...
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pbfd_torch.balance.dynamics import apart
 from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Extrapolating, Integrator, S
+from pbfd_torch.integrators.integrator import Extrapolating, Halved, Integrator, S
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.accuracy import Accuracy
@@ -246,7 +246,7 @@ def _tried(
     rough = coarse.take(worlds)
     off = apart(a, rough.q, end.q)
     if isinstance(integrator, Extrapolating):
-        end = integrator.extrapolated(a, before, rough, middle, end, off, accuracy)
+        end = integrator.extrapolated(a, half.scene.terms, Halved(before, rough, middle, end, off, accuracy))
     end = replaced(end, hazards=before.hazards | middle.hazards | end.hazards)
 
     def added(old: Tensor, one: Tensor, other: Tensor) -> Tensor:

@@ -6,6 +6,7 @@
 namespace pbfd {
 
 constexpr double FLATTEST = 0.3, FARTHEST = 2.0, EXCESS = 1e-2, NOISE = 1e-4, RESERVE = 1e-2;
+constexpr double SMOOTH_GAIN = 0.25;  // of what a step gains of velocity: where halving it changes more, something strikes within
 constexpr double PATIENCE = 3, FAST = 1.9106729782512120;  // halvings; 2 cos(.3 rad), of the trace of a rotation by so much
 
 // Attributes as of `Velocities` in Python, [nq], [nv] each, three energies, and its memory.
@@ -178,12 +179,30 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
   }
   V speed(const State& x, int i) const { return fma(V(0.5), x.steady[i] + x.lag[i], x.v[i]); }
 
-  // (4 x(Δt/2) − x(Δt))/3 of lanes at the end of two halves, and 2 x(Δt/2) − x(Δt) where something has pressed.
-  void extrapolate(M which, M pressed, const V* coarse, const V* coarse_speed, State& x) {
+  // (4 x(Δt/2) − x(Δt))/3 of lanes at the end of two halves, and 2 x(Δt/2) − x(Δt) where something has pressed and halving changes
+  // little of what the step from `base` gains: of configurations and momenta, so that what is kept of these is kept. coarse,
+  // coarse_speed: of the whole step; at, axes: room.
+  void extrapolate(M which, M pressed, const V* coarse, const V* coarse_speed, const State& base, State& x, Poses<V> at, V* axes) {
     if (!any(which)) return;
     const V share = select(pressed, V(1), V(1.0 / 3));
-    for (int i = 0; i < plan.nv; i++) x.v[i] = select(which, fma(share, speed(x, i) - coarse_speed[i], x.v[i]), x.v[i]);
+    for (int i = 0; i < plan.nv; i++) {
+      total[i] = speed(x, i);
+      impulse[i] = total[i] - coarse_speed[i], rough[i] = total[i] - speed(base, i);
+    }
+    carry(coarse, coarse_speed, at, axes, other), carry(x.q, total, at, axes, momentum);
+    const M steadily = momenta.kinetic(at, axes, impulse) <= V(SMOOTH_GAIN * SMOOTH_GAIN) * momenta.kinetic(at, axes, rough);
+    which = which & (steadily | !pressed);
+    carry(x.q, x.push, at, axes, impulse), carry(x.q, x.steady, at, axes, rough), carry(x.q, x.lag, at, axes, smooth);
+    for (int i = 0; i < plan.nv; i++) momentum[i] = fma(share, momentum[i] - other[i], momentum[i]);
     difference(plan, coarse, x.q, other), retract(plan, x.q, other, share, room_to_begin);
+    carry(room_to_begin, total, at, axes, other), momenta.masses(axes);
+    factor(tree(plan), momenta.matrix);
+    for (V* p : {momentum, impulse, rough, smooth}) substitute(tree(plan), momenta.matrix, p);
+    for (int i = 0; i < plan.nv; i++) {
+      x.push[i] = select(which, impulse[i], x.push[i]), x.steady[i] = select(which, rough[i], x.steady[i]);
+      x.lag[i] = select(which, smooth[i], x.lag[i]);
+      x.v[i] = select(which, fma(V(-0.5), x.steady[i] + x.lag[i], momentum[i]), x.v[i]);
+    }
     for (int i = 0; i < plan.nq; i++) x.q[i] = select(which, room_to_begin[i], x.q[i]);
   }
 
@@ -200,6 +219,14 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
   }
 
  private:
+  // The momenta of bodies and rotors that are at q and move with v; at, axes: where they are then.
+  void carry(const V* q, const V* v, Poses<V> at, V* axes, V* out) {
+    place(plan, q, at, axes), pose_rates(plan, at, axes, v, momenta.twist, momenta.rates);
+    for (int k = 0; k < plan.nodes; k++) momenta.take(k, at, momenta.rates + (D * D + D) * k);
+    for (int i = 0; i < plan.nv; i++) out[i] = V(plan.armature[i]) * v[i];
+    momenta.add_to(out, axes);
+  }
+
   // The share of smooth forces that comes early.
   V early(const Balance<V, N, D>& b, int i) const { return fma(V(2), b.fitted[i], V(-1)); }
 };

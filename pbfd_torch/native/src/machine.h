@@ -349,7 +349,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (any(judged)) {
       place(plan, coarse, reached[0], axes), place(plan, after.q, reached[1], axes);
       off = select(at_once, estimate, apart(plan, reached[0], reached[1]));
-      if constexpr (Scheme::extrapolates) scheme.extrapolate(agreed(judged & !at_once, off), pressed, coarse, coarse_speed, after);
+      if constexpr (Scheme::extrapolates) scheme.extrapolate(agreed(judged & !at_once, off), pressed, coarse, coarse_speed, base, after, reached[0], axes);
     }
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i) || lane(cut, i)) continue;
