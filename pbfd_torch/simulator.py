@@ -306,8 +306,8 @@ class EventSimulator(Simulator[S]):
 
     def _stepping(self) -> tuple[Stepper[S], str, str]:
         if self._made is None:
-            _, name, reason = super()._stepping()
-            self._made = EventStepper(self.eager, self._maker), name, reason
+            fixed, name, reason = super()._stepping()
+            self._made = EventStepper(fixed), name, reason
         return self._made
 
     def _maker(self, eager: EagerStepper[Any]) -> Stepper[Any]:

@@ -93,10 +93,12 @@ class Compared:
         return (self.after.q - self.expected.q).abs().amax(-1) < 1e-7
 
     def require_roots(self, tolerance: float = 1e-9) -> None:
-        """What the core solves directly are roots by the reference's own error."""
+        """What the core solves directly are roots by the reference's own error, but for rounding in single precision: what is just
+        within the tolerance to one may be just beyond it to the other."""
         objective = self.stepper.objective(self.before, self.control)
         error = objective.error(objective.evaluate(self.after.q), tolerance)
-        assert bool((error[self.solution.status == int(Status.SOLVED)] <= tolerance).all())
+        most = tolerance if error.dtype == torch.float64 else 1.02 * tolerance
+        assert bool((error[self.solution.status == int(Status.SOLVED)] <= most).all())
 
     def require_alike(self, names: Sequence[str], rtol: float = 1e-5, atol: float = 1e-5, where: Tensor | None = None) -> None:
         """Fields of the states that follow, where they end at the same root."""

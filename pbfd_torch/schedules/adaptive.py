@@ -9,21 +9,19 @@ control changes and its state is recorded.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from dataclasses import dataclass
-from typing import Generic, Self
+from typing import Generic
 
 import torch
 from torch import Tensor
 
 from pbfd_torch.balance.dynamics import apart
-from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Extrapolating, Halved, Integrator, S
-from pbfd_torch.scene import Scene
+from pbfd_torch.integrators.integrator import Extrapolating, Halved, S
+from pbfd_torch.schedules.composed import Composed
 from pbfd_torch.solvers.objective import FALLBACKS, Solution, Status
 from pbfd_torch.stepping.accuracy import Accuracy
-from pbfd_torch.stepping.stepper import Solver, Stepper
+from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
@@ -34,44 +32,14 @@ BRINK, REST = 1e-6, 1e-4  # of the step, before a strike; of the frame, after it
 CUTS = 5  # how often a step may be cut short
 
 
-class AdaptiveStepper(Generic[S]):
+class AdaptiveStepper(Composed[S]):
     """A `Stepper` whose steps, the frames, are made of as many shorter ones as each world needs.
 
     `fixed`: makes the steps; its own step is the length of a frame, and of the longest step [s]."""
 
     def __init__(self, fixed: Stepper[S], accuracy: Accuracy) -> None:
-        self.fixed = fixed
+        super().__init__(fixed)
         self.accuracy = accuracy
-
-    @property
-    def scene(self) -> Scene:
-        return self.fixed.scene
-
-    @property
-    def integrator(self) -> Integrator[S]:
-        return self.fixed.integrator
-
-    @property
-    def step_size(self) -> Tensor:
-        """Of a frame."""
-        return self.fixed.step_size
-
-    @property
-    def dt(self) -> float:
-        """Of a frame."""
-        return self.fixed.dt
-
-    @property
-    def solver(self) -> Solver:
-        return self.fixed.solver
-
-    @property
-    def halvings(self) -> int:
-        return self.fixed.halvings
-
-    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
-        """As that of steps of the frame's length."""
-        return self.fixed.initial_state(q, v, control)
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """A frame of all worlds. Its way has the balance of the last step of every world, and no way back: which steps are taken
@@ -81,23 +49,6 @@ class AdaptiveStepper(Generic[S]):
             while frame.advance():
                 pass
             return frame.finish()
-
-    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
-        """See `Stepper`: of a step as long as the frame."""
-        return self.fixed.objective(state, control)
-
-    def take(self, worlds: Worlds) -> Self:
-        """See `Stepper`."""
-        return self._of(self.fixed.take(worlds))
-
-    def sized(self, step_size: Tensor) -> Self:
-        """See `Stepper`: frames of another length."""
-        return self._of(self.fixed.sized(step_size))
-
-    def _of(self, fixed: Stepper[S]) -> Self:
-        other = copy.copy(self)
-        other.fixed = fixed
-        return other
 
 
 class _Frame(Generic[S]):

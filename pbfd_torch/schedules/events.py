@@ -8,35 +8,30 @@ hard it touches a little later.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Generic, Self
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from pbfd_torch.balance.objective import BalanceObjective
-from pbfd_torch.integrators.integrator import Integrator, S
+from pbfd_torch.integrators.integrator import S
 from pbfd_torch.integrators.runge_kutta import standing
-from pbfd_torch.scene import Scene
 from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
+from pbfd_torch.schedules.composed import Composed
 from pbfd_torch.solvers.objective import Solution
-from pbfd_torch.stepping.eager import EagerStepper
-from pbfd_torch.stepping.stepper import Solver, Stepper
+from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.kinematics import retract
 
-Make = Callable[[EagerStepper[Any], Any, Tensor | None], tuple[Any, Solution]]
+Make = Callable[[Any, Any, Tensor | None], tuple[Any, Solution]]
 """Makes a step of a stepper from a state under a control: where it ends, and how it was solved."""
 LATER = (1e-6, 1e-5, 1e-4, 1e-3)  # of the step, after the instant: when it is felt how hard something touches
 
 
-def made_with_events(
-    make: Make, stepper: EagerStepper[S], state: S, control: Tensor | None, cuts: int = CUTS
-) -> tuple[S, Solution]:
+def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor | None, cuts: int = CUTS) -> tuple[S, Solution]:
     """The step, in worlds in which something strikes up to there and on from there, with so many cuts at most. It carries the
     derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that was tried has
     cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it."""
@@ -55,19 +50,19 @@ def made_with_events(
     at, touch, found = _at_strike(make, part, before, held, worlds.rows(solution.strike) * whole.detach(), whole)
     rest = part.sized(whole - at)
     after, last = made_with_events(
-        make, rest, part.integrator.resized(part.articulation, touch, at, rest.step_size), held, cuts - 1
+        make, rest, part.integrator.resized(part.scene.articulation, touch, at, rest.step_size), held, cuts - 1
     )
-    after = part.integrator.resized(part.articulation, after, rest.step_size, whole)
+    after = part.integrator.resized(part.scene.articulation, after, rest.step_size, whole)
     after = replaced(after, hazards=touch.hazards | after.hazards)
     return put(end, after, worlds, everywhere), _joined(solution, worlds, (found, last))
 
 
 def _at_strike(
-    make: Make, stepper: EagerStepper[S], state: S, control: Tensor | None, at: Tensor, whole: Tensor
+    make: Make, stepper: Stepper[S], state: S, control: Tensor | None, at: Tensor, whole: Tensor
 ) -> tuple[Tensor, S, Solution]:
     """When something strikes after a state [s] `[n]`, about at `at`, the state there, and how it was made; whole: the step [s]
     `[n]` that the state's history is for."""
-    a, integrator = stepper.articulation, stepper.integrator
+    a, integrator = stepper.scene.articulation, stepper.integrator
 
     def reached(time: Tensor) -> tuple[S, Solution]:
         return make(stepper.sized(time), integrator.resized(a, state, whole, time), control)
@@ -80,17 +75,17 @@ def _at_strike(
             break
         at = torch.where(early, strike * at, at)
         end, solution = reached(at)
-        spent = spent + solution.evaluations
+        spent = spent + torch.where(early, solution.evaluations, 0)
     if end.q.requires_grad:
         at = at + _shift(stepper.sized(at), end, control, at)
         end, solution = reached(at)
     return at, end, replaced(solution, evaluations=spent, steps=torch.ones_like(solution.status))
 
 
-def _shift(stepper: EagerStepper[S], end: S, control: Tensor | None, at: Tensor) -> Tensor:
+def _shift(stepper: Stepper[S], end: S, control: Tensor | None, at: Tensor) -> Tensor:
     """How much later something strikes as the end of a step does up to there changes: zero `[n]` [s], with its derivatives; without
     any where nothing touches soon."""
-    a = stepper.articulation
+    a = stepper.scene.articulation
     plain = replaced(end, **{f.name: _still(getattr(end, f.name)) for f in dataclasses.fields(end)})
     v = stepper.integrator.velocity(a, plain, at)
     objective = standing(stepper.objective(plain, control))
@@ -144,64 +139,15 @@ def _joined(whole: Solution, worlds: Worlds, parts: tuple[Solution, Solution]) -
     )
 
 
-class EventStepper(Generic[S]):
-    """A `Stepper` whose steps are cut where something strikes. `eager`: their definition; `engine`: makes the steps of such."""
-
-    def __init__(self, eager: EagerStepper[S], engine: Callable[[EagerStepper[Any]], Stepper[Any]]) -> None:
-        self.eager, self.engine = eager, engine
-
-    @property
-    def scene(self) -> Scene:
-        return self.eager.scene
-
-    @property
-    def integrator(self) -> Integrator[S]:
-        return self.eager.integrator
-
-    @property
-    def step_size(self) -> Tensor:
-        """Of a step that is not cut."""
-        return self.eager.step_size
-
-    @property
-    def dt(self) -> float:
-        return self.eager.dt
-
-    @property
-    def solver(self) -> Solver:
-        return self.eager.solver
-
-    @property
-    def halvings(self) -> int:
-        return self.eager.halvings
-
-    def initial_state(self, q: Tensor, v: Tensor, control: Tensor | None) -> S:
-        """See `Stepper`."""
-        return self.engine(self.eager).initial_state(q, v, control)
+class EventStepper(Composed[S]):
+    """A `Stepper` whose steps are cut where something strikes. `fixed`: makes the parts, and the steps that are not cut."""
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. Its way has the balance of the whole step and no way back: derivatives go through its parts."""
 
-        def make(stepper: EagerStepper[Any], start: Any, held: Tensor | None) -> tuple[Any, Solution]:
-            return self.engine(stepper).made(start, held)[:2]
+        def make(stepper: Stepper[S], start: S, held: Tensor | None) -> tuple[S, Solution]:
+            return stepper.made(start, held)[:2]
 
         with torch.no_grad():
-            end, solution = made_with_events(make, self.eager, state, control)
+            end, solution = made_with_events(make, self.fixed, state, control)
         return end, solution, Way(end.q, (), self.objective(state, control))
-
-    def objective(self, state: S, control: Tensor | None) -> BalanceObjective:
-        """See `Stepper`: of the whole step."""
-        return self.eager.objective(state, control)
-
-    def take(self, worlds: Worlds) -> Self:
-        """See `Stepper`."""
-        return self._of(self.eager.take(worlds))
-
-    def sized(self, step_size: Tensor) -> Self:
-        """See `Stepper`."""
-        return self._of(self.eager.sized(step_size))
-
-    def _of(self, eager: EagerStepper[S]) -> Self:
-        other = copy.copy(self)
-        other.eager = eager
-        return other
