@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch import EnergyMomentum, EventSimulator, Scene, Simulator
-from pbfd_torch.contact.shapes import Sphere
+from pbfd_torch.contact.shapes import Box, Shape, Sphere
 from pbfd_torch.errors import InputError
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Engine, Native, Torch
@@ -22,6 +22,7 @@ from pbfd_torch.terms.normal_force import NormalForce
 from pbfd_torch.terms.restitution import Restitution
 from tests.touching_bodies import free_bodies, posed
 
+BALL = Sphere(0.1)
 FIRM = NormalForce(1e12)  # what an elastic contact gives way is lost to the rebound
 ENGINES = pytest.mark.parametrize("engine", [Torch(), Native()], ids=lambda x: x.name)
 GRAVITY, HEIGHT = 9.81, 0.5
@@ -33,9 +34,9 @@ def placed(height: float) -> Tensor:
     return posed((0, 0, height))
 
 
-def bouncing(restitution: float | None) -> Scene:
-    """A ball of 1 kg and .1 m above the ground."""
-    scene = free_bodies((Sphere(0.1),), (1.0,), mu=0.0)
+def bouncing(restitution: float | None, shape: Shape = BALL) -> Scene:
+    """A body of 1 kg and .1 m, a ball, above the ground."""
+    scene = free_bodies((shape,), (1.0,), mu=0.0)
     law = None if restitution is None else Restitution(restitution)
     terms = [replaced(x, restitution=law, normal_force=FIRM) if isinstance(x, Contact) else x for x in scene.terms]
     return replaced(scene, terms=tuple(terms))
@@ -65,12 +66,13 @@ def collided(start: Tensor, restitution: float | None, engine: Engine, dt: float
 
 
 @ENGINES
+@pytest.mark.parametrize("shape", [BALL, Box((0.1, 0.1, 0.1))], ids=lambda x: type(x).__name__)
 @pytest.mark.parametrize("restitution", [None, 1.0])
 @pytest.mark.parametrize("dt", [0.05, 0.02, 0.007])
-def test_a_ball_that_falls(engine: Engine, restitution: float | None, dt: float) -> None:
-    """From .5 m it strikes after √(2h/g), to 1e-6 s, whatever the step; until then its energy is exact, and then it keeps all of it
-    or none: what the contact gives way is a share of 1e-4."""
-    simulator = EventSimulator(bouncing(restitution), dt, engine=engine)
+def test_a_body_that_falls(engine: Engine, shape: Shape, restitution: float | None, dt: float) -> None:
+    """A ball, or a box with four corners at once, from .5 m: it strikes after √(2h/g), to 1e-6 s, whatever the step; until then its
+    energy is exact, and then it keeps all of it or none: what the contact gives way is a share of 1e-4."""
+    simulator = EventSimulator(bouncing(restitution, shape), dt, engine=engine)
     assert simulator.engine == engine.name
     state = simulator.initial_state(placed(0.1 + HEIGHT))
     energy: list[float] = []
@@ -105,6 +107,26 @@ def test_several_worlds_strike_at_their_own_time() -> None:
         alone, _ = simulator.step(simulator.initial_state(q[k : k + 1]))
         assert torch.equal(alone.q[0], state.q[k])
         assert torch.equal(alone.v[0], state.v[k])
+
+
+@ENGINES
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_any_batch(engine: Engine, batch: tuple[int, ...]) -> None:
+    """A single world without batch, and batches of more dimensions: as a batch of one, derivatives too."""
+    simulator = EventSimulator(bouncing(1.0), 0.02, engine=engine)
+
+    def stepped(shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+        q = placed(0.1 + 1e-3)[0].expand(*shape, 7).clone().requires_grad_()
+        state, solution = simulator.step(simulator.initial_state(q))
+        assert solution.steps is not None
+        assert solution.steps.shape == shape
+        assert bool((solution.steps == 2).all())
+        (by_q,) = torch.autograd.grad(state.q.sum(), q)
+        return state.q.detach(), by_q
+
+    for found, expected in zip(stepped(batch), stepped((1,)), strict=True):
+        assert found.shape == (*batch, 7)
+        torch.testing.assert_close(found, expected[0].expand(*batch, 7), rtol=1e-12, atol=1e-12)
 
 
 def test_engines_agree() -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from pbfd_torch.integrators.runge_kutta import standing
 from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
 from pbfd_torch.schedules.composed import Composed
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
@@ -35,6 +36,10 @@ def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor 
     """The step, in worlds in which something strikes up to there and on from there, with so many cuts at most. It carries the
     derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that was tried has
     cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it."""
+    if state.time.ndim == 0:  # a single world without batch: a batch of one
+        alone = mapped(lambda x: x[None], state)
+        made = made_with_events(make, stepper, alone, None if control is None else control[None], cuts)
+        return cast(tuple[S, Solution], mapped(lambda x: x[0], made))
     end, solution = make(stepper, state, control)
     solution = replaced(solution, steps=torch.ones_like(solution.status))
     if cuts == 0 or solution.strike is None:
