@@ -286,7 +286,7 @@ class EventSimulator(Simulator[S]):
     for others. A step is cut at most five times, and no closer to its start than 1e-6 of it: what strikes again so soon, and what
     strikes while something else presses, does so within a step as in a `Simulator`. The solution's `strike` is the share of the
     step after which something first strikes, its `steps` the parts of it. Each part is a call of its own, and a rollout is not
-    one call of the core."""
+    one call of the core. Derivatives by autograd and forward_ad, not by torch.func."""
 
     def __init__(
         self,

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from pbfd_torch import EnergyMomentum, EventSimulator, Scene, Simulator
 from pbfd_torch.contact.shapes import Box, Shape, Sphere
-from pbfd_torch.errors import InputError
+from pbfd_torch.errors import GradientError, InputError
 from pbfd_torch.models import SCENES
 from pbfd_torch.native.engine import Engine, Native, Torch
 from pbfd_torch.solvers.objective import Status
@@ -219,6 +220,20 @@ def test_by_central_differences() -> None:
     # t* = (fast − u)/g, so v = e fast − g T + fast − u
     assert float(found[0]) == pytest.approx(1.8 * GRAVITY / fast, rel=5e-3)
     assert float(found[1]) == pytest.approx(1.8 * u / fast - 1, rel=5e-3)
+
+
+def test_forward_derivatives() -> None:
+    """Are those of reverse mode; torch.func, which cannot have them, is told so."""
+    height, push = (torch.tensor([x], dtype=torch.float64) for x in (0.45, 0.3))
+    given = height.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(rebound(given, push, 0.02).sum(), given)
+    with forward_ad.dual_level():
+        moved = rebound(forward_ad.make_dual(height, torch.ones_like(height)), push, 0.02)
+        torch.testing.assert_close(forward_ad.unpack_dual(moved).tangent, expected, rtol=1e-7, atol=0)
+    simulator = EventSimulator(bouncing(1.0), 0.02)
+    state = simulator.initial_state(placed(0.2))
+    with pytest.raises(GradientError, match=r"torch\.func cannot look into"):
+        torch.func.jvp(lambda q: simulator.step(replaced(state, q=q))[0].q, (state.q,), (torch.ones_like(state.q),))
 
 
 def test_values_are_the_same_to_the_bit() -> None:

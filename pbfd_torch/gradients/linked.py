@@ -16,13 +16,13 @@ from torch import Tensor
 
 from pbfd_torch.errors import GradientError, GradientWarning
 from pbfd_torch.gradients.implicit import Doubt, Doubtful, Factors, Gradients, followed
-from pbfd_torch.gradients.parts import carries, of_parts, parts_of, precise
+from pbfd_torch.gradients.parts import of_parts, parts_of, precise
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import Solution, Status, is_solved
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
-from pbfd_torch.tensors.plain import plain, wrapped
+from pbfd_torch.tensors.plain import carries, plain, wrapped
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
 
 

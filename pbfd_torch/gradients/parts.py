@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.plain import carries
 from pbfd_torch.tensors.structures import in_dtype, tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.terms.load import Term
@@ -27,13 +28,6 @@ class Parts:
     gravity: Tensor
     step_size: Tensor
     adapted: Sequence[Term]
-
-
-def carries(value: Tensor) -> bool:
-    """Whether a tensor carries derivatives, backward or forward ones."""
-    if torch.is_grad_enabled() and value.requires_grad:
-        return True
-    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
 
 
 class Carriers:

@@ -16,10 +16,10 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linked import Engine, Linked, Made, Play, doubts_of
-from pbfd_torch.gradients.parts import carries
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import is_solved
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.plain import carries
 from pbfd_torch.tensors.structures import tensors_of
 
 

@@ -15,6 +15,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from pbfd_torch.errors import GradientError
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.integrators.runge_kutta import standing
 from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
@@ -24,6 +25,8 @@ from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
+from pbfd_torch.tensors.plain import carries, wrapped
+from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.kinematics import retract
 
@@ -35,7 +38,10 @@ LATER = (1e-6, 1e-5, 1e-4, 1e-3)  # of the step, after the instant: when it is f
 def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor | None, cuts: int = CUTS) -> tuple[S, Solution]:
     """The step, in worlds in which something strikes up to there and on from there, with so many cuts at most. It carries the
     derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that was tried has
-    cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it."""
+    cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it. Raises
+    `GradientError` in torch.func."""
+    if any(map(wrapped, tensors_of(state))):
+        raise GradientError("torch.func cannot look into steps that are cut where something strikes: use autograd or forward_ad")
     if state.time.ndim == 0:  # a single world without batch: a batch of one
         alone = mapped(lambda x: x[None], state)
         made = made_with_events(make, stepper, alone, None if control is None else control[None], cuts)
@@ -81,7 +87,7 @@ def _at_strike(
         at = torch.where(early, strike * at, at)
         end, solution = reached(at)
         spent = spent + torch.where(early, solution.evaluations, 0)
-    if end.q.requires_grad:
+    if carries(end.q):
         at = at + _shift(stepper.sized(at), end, control, at)
         end, solution = reached(at)
     return at, end, replaced(solution, evaluations=spent, steps=torch.ones_like(solution.status))

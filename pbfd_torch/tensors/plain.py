@@ -1,9 +1,10 @@
-"""The plain tensor inside what torch.func works on, for what carries no derivatives: other libraries, and the host's choices."""
+"""Which tensors carry derivatives, and the plain one inside what torch.func works on: for other libraries, and for choices."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 
 def wrapped(value: Tensor) -> bool:
@@ -16,3 +17,10 @@ def plain(value: Tensor) -> Tensor:
     while wrapped(value):
         value = torch._C._functorch.get_unwrapped(value)
     return value.detach()
+
+
+def carries(value: Tensor) -> bool:
+    """Whether a tensor carries derivatives, backward or forward ones."""
+    if torch.is_grad_enabled() and value.requires_grad:
+        return True
+    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
