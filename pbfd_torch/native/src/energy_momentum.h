@@ -189,13 +189,14 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
       total[i] = speed(x, i);
       impulse[i] = total[i] - coarse_speed[i], rough[i] = total[i] - speed(base, i);
     }
-    carry(coarse, coarse_speed, at, axes, other), carry(x.q, total, at, axes, momentum);
+    place(plan, coarse, at, axes), carry(coarse_speed, at, axes, other);
+    place(plan, x.q, at, axes), carry(total, at, axes, momentum);
     const M steadily = momenta.kinetic(at, axes, impulse) <= V(SMOOTH_GAIN * SMOOTH_GAIN) * momenta.kinetic(at, axes, rough);
     which = which & (steadily | !pressed);
-    carry(x.q, x.push, at, axes, impulse), carry(x.q, x.steady, at, axes, rough), carry(x.q, x.lag, at, axes, smooth);
+    carry(x.push, at, axes, impulse), carry(x.steady, at, axes, rough), carry(x.lag, at, axes, smooth);
     for (int i = 0; i < plan.nv; i++) momentum[i] = fma(share, momentum[i] - other[i], momentum[i]);
     difference(plan, coarse, x.q, other), retract(plan, x.q, other, share, room_to_begin);
-    carry(room_to_begin, total, at, axes, other), momenta.masses(axes);
+    place(plan, room_to_begin, at, axes), carry(total, at, axes, other), momenta.masses(axes);
     factor(tree(plan), momenta.matrix);
     for (V* p : {momentum, impulse, rough, smooth}) substitute(tree(plan), momenta.matrix, p);
     for (int i = 0; i < plan.nv; i++) {
@@ -219,9 +220,9 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
   }
 
  private:
-  // The momenta of bodies and rotors that are at q and move with v; at, axes: where they are then.
-  void carry(const V* q, const V* v, Poses<V> at, V* axes, V* out) {
-    place(plan, q, at, axes), pose_rates(plan, at, axes, v, momenta.twist, momenta.rates);
+  // The momenta of bodies and rotors that move with v.
+  void carry(const V* v, Poses<V> at, const V* axes, V* out) {
+    pose_rates(plan, at, axes, v, momenta.twist, momenta.rates);
     for (int k = 0; k < plan.nodes; k++) momenta.take(k, at, momenta.rates + (D * D + D) * k);
     for (int i = 0; i < plan.nv; i++) out[i] = V(plan.armature[i]) * v[i];
     momenta.add_to(out, axes);

@@ -349,7 +349,8 @@ template <class V, class N, int D, class Scheme> struct Machine {
     if (any(judged)) {
       place(plan, coarse, reached[0], axes), place(plan, after.q, reached[1], axes);
       off = select(at_once, estimate, apart(plan, reached[0], reached[1]));
-      if constexpr (Scheme::extrapolates) scheme.extrapolate(agreed(judged & !at_once, off), pressed, coarse, coarse_speed, base, after, reached[0], axes);
+      if constexpr (Scheme::extrapolates)
+        scheme.extrapolate(agreed(judged & !at_once, off), pressed, coarse, coarse_speed, base, after, reached[0], axes);
     }
     for (int i = 0; i < W; i++) {
       if (!lane(ends, i) || lane(cut, i)) continue;
@@ -376,7 +377,7 @@ template <class V, class N, int D, class Scheme> struct Machine {
     copy(plan, begin, before, base);
     scheme.resize(begin, lengths(), whole, before);
   }
-  // Where a whole step and its halves say the same, and nothing has struck in between; what lies still is damped best by the halves.
+  // Where a whole step and its halves say the same and nothing has struck in between; what lies still is damped best by halves.
   M agreed(M which, V off) const {
     const V most = V(T(rules.accuracy));
     return which & (off <= most) & ((pressed & (off > V(T(STILL)) * most)) | !struck);
