@@ -68,15 +68,18 @@ class Simulator(Generic[S]):
 
     def _stepping(self) -> tuple[Stepper[S], str, str]:
         if self._made is None:
-            engine = self._engine
-            self._made = chosen(self.eager) if engine is None else (engine.stepper(self.eager), engine.name, "")
+            self._made = self._engined(self.eager)
         return self._made
+
+    def _engined(self, eager: EagerStepper[Any]) -> tuple[Stepper[Any], str, str]:
+        """What the engine makes of a stepper: see `_made`."""
+        return chosen(eager) if self._engine is None else (self._engine.stepper(eager), self._engine.name, "")
 
     def _maker(self, eager: EagerStepper[Any]) -> Stepper[Any]:
         """What makes the steps of a stepper such as this one's."""
         if eager is self.eager:
             return self.stepper
-        return chosen(eager)[0] if self._engine is None else self._engine.stepper(eager)
+        return self._engined(eager)[0]
 
     def _carriers(self) -> Carriers:
         if self._carrying is None:
@@ -311,10 +314,15 @@ class EventSimulator(Simulator[S]):
         return self._made
 
     def _maker(self, eager: EagerStepper[Any]) -> Stepper[Any]:
-        return chosen(eager)[0] if self._engine is None else self._engine.stepper(eager)
+        """Of parts: not what cuts them."""
+        maker = super()._maker(eager)
+        return maker.fixed if isinstance(maker, EventStepper) else maker
 
     def step(self, state: S, control: Array | None = None) -> tuple[S, Solution]:
         """See `Simulator.step` and `schedules.events.made_with_events`."""
+        control = self.scene.controlled(control, state.q.shape[:-1])
+        if not self._carriers().may_carry(*vars(state).values(), *state.memory, control):
+            return self.stepper.made(state, control)[:2]
 
         def make(eager: EagerStepper[Any], start: Any, held: Tensor | None) -> tuple[Any, Solution]:
             linked = Linked(eager, self.gradients, self._maker)
@@ -323,7 +331,7 @@ class EventSimulator(Simulator[S]):
             end, made = linked.step(start, held)
             return end, made.solution
 
-        return made_with_events(make, self.eager, state, self.scene.controlled(control, state.q.shape[:-1]))
+        return made_with_events(make, self.eager, state, control)
 
     def trajectory(
         self,

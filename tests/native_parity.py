@@ -68,8 +68,7 @@ class Compared:
         before, control: where each step begins, and what it is given.
         after, solution: of the core.
         expected, found: of the reference.
-        both: which both solve directly; unless asked otherwise.
-        alike: which of these end at the same root.
+        both: which both solve directly. near: which end at the same root. alike: both.
     """
 
     stepper: EagerStepper[Any]

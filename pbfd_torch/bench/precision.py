@@ -132,22 +132,18 @@ def step_count(duration: float, dt: float) -> int:
 
 def our_motion(case: Case, integrator: str, dt: float, duration: float, engine: Engine | None = None) -> Motion:
     """From the scene's start, recorded."""
+    scheme = INTEGRATORS[integrator]()
+    return Motion(integrator, dt, *recorded(case, lambda scene: Simulator(scene, dt, scheme, engine=engine), duration))
+
+
+def recorded(case: Case, make: Callable[[Scene], Simulator[State]], duration: float) -> tuple[Track, Rollout, str]:
+    """The motion by what steps a scene, its record, and the engine that made the steps."""
     setup = case.setup(case.tracked_worlds)
-    simulator = Simulator(setup.scene, dt, integrator=INTEGRATORS[integrator](), engine=engine)
-    steps = step_count(duration, dt)
+    simulator = make(setup.scene)
+    dt, steps = simulator.dt, step_count(duration, simulator.dt)
     controls = case.controls(dt, dt * torch.arange(steps, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
     start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
     rollout = simulator.rollout(start, controls, steps if controls is None else None)
-    return Motion(integrator, dt, Track.of_rollout(setup, rollout), rollout, simulator.engine)
-
-
-def adaptive_motion(case: Case, make: Callable[[Scene], Simulator[State]], duration: float) -> tuple[Track, Rollout, str]:
-    """The same in frames of steps of the worlds' own choice, and the engine that made them."""
-    setup = case.setup(case.tracked_worlds)
-    simulator, frames = make(setup.scene), step_count(duration, FRAME)
-    controls = case.controls(FRAME, FRAME * torch.arange(frames, dtype=torch.float64)[:, None].expand(-1, setup.worlds))
-    start = simulator.initial_state(setup.q, setup.v, None if controls is None else controls[0])
-    rollout = simulator.rollout(start, controls, frames if controls is None else None)
     return Track.of_rollout(setup, rollout), rollout, simulator.engine
 
 
@@ -237,7 +233,7 @@ def our_reference(case: Case, accuracy: float, engine: Engine | None = None) -> 
         def make(scene: Scene) -> Simulator[State]:
             return AdaptiveSimulator(scene, FRAME, length, INTEGRATORS[OWN](), Fallbacks.within(FINELY), SHORTEST, engine)
 
-        return adaptive_motion(case, make, until)[0]
+        return recorded(case, make, until)[0]
 
     value = case.observe(motion(accuracy))
     return Reference(value, case.error(motion(10 * accuracy), value), f"steps of {accuracy:g} m by {OWN}")
@@ -275,7 +271,7 @@ def adaptive_row(
     def made(scene: Scene) -> Simulator[State]:
         return AdaptiveSimulator(scene, FRAME, accuracy, INTEGRATORS[integrator](), engine=engine)
 
-    track, rollout, name = adaptive_motion(case, made, case.duration)
+    track, rollout, name = recorded(case, made, case.duration)
     steps = int(rollout.substeps.sum())
     return {
         **_ours(case, track, rollout, reference),

@@ -8,7 +8,6 @@ hard it touches a little later.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -26,7 +25,7 @@ from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.stepping.way import Way
 from pbfd_torch.stepping.worlds import put
 from pbfd_torch.tensors.plain import carries, wrapped
-from pbfd_torch.tensors.structures import tensors_of
+from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.kinematics import retract
 
@@ -97,7 +96,7 @@ def _shift(stepper: Stepper[S], end: S, control: Tensor | None, at: Tensor) -> T
     """How much later something strikes as the end of a step does up to there changes: zero `[n]` [s], with its derivatives; without
     any where nothing touches soon."""
     a = stepper.scene.articulation
-    plain = replaced(end, **{f.name: _still(getattr(end, f.name)) for f in dataclasses.fields(end)})
+    plain: S = mapped_tensors(end, torch.detach)
     v = stepper.integrator.velocity(a, plain, at)
     objective = standing(stepper.objective(plain, control))
     found = torch.zeros_like(at)
@@ -113,13 +112,6 @@ def _shift(stepper: Stepper[S], end: S, control: Tensor | None, at: Tensor) -> T
         if bool((felt > 0).all()):
             break
     return found
-
-
-def _still(x: Any) -> Any:
-    """A field of a state without derivatives."""
-    if isinstance(x, tuple):
-        return tuple(map(_still, x))
-    return x.detach() if isinstance(x, Tensor) else x
 
 
 def _joined(whole: Solution, worlds: Worlds, parts: tuple[Solution, Solution]) -> Solution:
@@ -154,11 +146,11 @@ class EventStepper(Composed[S]):
     """A `Stepper` whose steps are cut where something strikes. `fixed`: makes the parts, and the steps that are not cut."""
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
-        """See `Stepper`. Its way has the balance of the whole step and no way back: derivatives go through its parts."""
+        """See `Stepper`. Its way leads nowhere back: derivatives go through its parts."""
 
         def make(stepper: Stepper[S], start: S, held: Tensor | None) -> tuple[S, Solution]:
             return stepper.made(start, held)[:2]
 
         with torch.no_grad():
             end, solution = made_with_events(make, self.fixed, state, control)
-        return end, solution, Way(end.q, (), self.objective(state, control))
+        return end, solution, Way(end.q)

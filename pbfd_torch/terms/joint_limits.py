@@ -23,7 +23,7 @@ from pbfd_torch.tree.kinematics import Placement
 
 _LAW = NormalForce(1.0, exponent=2.0)
 TOO_FAR = 0.02  # [rad or m] past a limit: ten times what the weight brings about
-RETURN = 0.2  # [s]
+RETURN = 0.2  # [s] in which a joint comes back from far beyond, but for a share of 1/e
 HELD = 4e-4  # [rad or m] past a limit under the largest force of the joint's actuators
 
 
