@@ -15,7 +15,7 @@ import torch
 from pbfd_torch.errors import InputError
 from pbfd_torch.native.processor import runnable
 
-INTERFACE = 14  # the version of src/interface.h that this file knows
+INTERFACE = 15  # the version of src/interface.h that this file knows
 FOLDER = Path(__file__).parent / "lib"
 CHOICE = "PBFD_NATIVE_TARGET"
 REMEDY = "install g++ and run pip install again, with --force-reinstall --no-deps --no-cache-dir"

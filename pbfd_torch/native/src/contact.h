@@ -288,9 +288,11 @@ template <class V, class N, int D> struct Contacts {
         if (const int m = mover(i); m >= 0) carriers.turn(m, stretched, stretched);
         for (int j = 0; j < 3; j++) t.moved[j] += stretched[j];
       }
-    bend<typename Pair::Surface>(i, t.center, t.solid, t.bend);
-    if constexpr (Pair::Surface::convex)
-      for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
+    if constexpr (!derived<V>) {
+      bend<typename Pair::Surface>(i, t.center, t.solid, t.bend);
+      if constexpr (Pair::Surface::convex)
+        for (V& x : t.bend) x = select(guard[(2 + D) * i] > V(0), V(0), x);
+    }
     Pair::Support::template arm<Pair::Surface::flat>(candidates, i, now.rotation + D * D * k, t.solid.normal, t.bend, t.arm);
     t.firmness = relaxed.firmness * V(candidates.firmness[i]), t.grip = grip[i];
     t.per_range = per_dt * V(candidates.per_release[i]);
@@ -330,7 +332,7 @@ template <class V, class N, int D> struct Contacts {
 
   [[gnu::noinline]] void turn(int k) {
     rotation_between<D>(now.rotation + D * D * k, before.rotation + D * D * k, turned_by + T * k);
-    log_jacobian<D>(turned_by + T * k, V(-0.5), rollings + T * T * k);
+    if constexpr (!derived<V>) log_jacobian<D>(turned_by + T * k, V(-0.5), rollings + T * T * k);
     turned[k] = true;
   }
 
@@ -341,7 +343,7 @@ template <class V, class N, int D> struct Contacts {
         V began[9];
         carriers.carry_rotation(m, before.rotation + 9 * k, began);
         rotation_between(now.rotation + 9 * k, began, carried_turn);
-        log_jacobian(carried_turn, V(-0.5), carried_rolling);
+        if constexpr (!derived<V>) log_jacobian(carried_turn, V(-0.5), carried_rolling);
         turning = k, turned_on = m;
       }
     t.turn = carried_turn, t.rolling = carried_rolling;

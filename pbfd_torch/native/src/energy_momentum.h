@@ -141,35 +141,7 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     }
     substitute(tree(plan), matrix, after.lag);
 
-    for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
-    const V first = momenta.kinetic(b.start, b.start_axes, total);
-    for (int i = 0; i < n; i++) total[i] = fma(half, after.steady[i], after.v[i]);
-    const V last = momenta.kinetic(b.now, b.axes, total);
-    V work(0), spurious(0), turned(0);
-    for (int i = 0; i < n; i++) {
-      work = fma(h * (rough[i] + smooth[i]), after.average[i], work);
-      spurious = fma(h * b.residual[i], after.average[i], spurious);
-      turned = max(turned, abs(h * after.average[i]) * V(plan.turns[i]));
-    }
-    V lost(0), flattest(1);
-    for (int k = 0; k < plan.nodes; k++) {
-      V x[D], x0[D], middle[D * D];
-      times<D>(b.now.rotation + D * D * k, plan.center + D * k, x), times<D>(b.start.rotation + D * D * k, plan.center + D * k, x0);
-      for (int i = 0; i < D; i++) {
-        const V fell = (x[i] + b.now.position[D * k + i]) - (x0[i] + b.start.position[D * k + i]);
-        lost = fma(V(plan.mass[k]) * V(plan.gravity[i]), fell, lost);
-      }
-      for (int i = 0; i < D * D; i++) middle[i] = half * (b.now.rotation[D * D * k + i] + b.start.rotation[D * D * k + i]);
-      flattest = min(flattest, determinant<D>(middle));
-    }
-    const V falls = falling_energy(plan, h), energy = last - first - lost - work;
-    const V peak = max(before.peak[0], max(first, last) + falls), sum = max(before.surplus[0] + energy, V(-RESERVE) * peak);
-    after.gained[0] = energy, after.peak[0] = peak, after.surplus[0] = sum;
-    const V whole_energy = first + last + falls, gained = energy - spurious, surplus = sum - spurious;
-    const M excess = (energy > V(EXCESS) * whole_energy) & (gained > V(EXCESS) * whole_energy);
-    const M overdrawn = (sum > surplus_allowed * peak) & (energy > V(NOISE) * peak) & (surplus > surplus_allowed * peak) &
-                        (gained > V(NOISE) * peak);
-    return on_chord & ((flattest < V(FLATTEST)) | (turned > V(FARTHEST)) | excess | overdrawn);
+    return account(b, before, after, on_chord);
   }
 
   M pushed(const State& x) const {
@@ -226,6 +198,45 @@ template <class V, class N, int D = 3> struct EnergyMomentum {
     for (int k = 0; k < plan.nodes; k++) momenta.take(k, at, momenta.rates + (D * D + D) * k);
     for (int i = 0; i < plan.nv; i++) out[i] = V(plan.armature[i]) * v[i];
     momenta.add_to(out, axes);
+  }
+
+  // What the step has gained beyond the forces' work, into the state after it; which lanes refuse it. It has no derivatives.
+  M account(const Balance<V, N, D>& b, const State& before, State& after, M on_chord) {
+    if constexpr (derived<V>) {
+      after.gained[0] = after.surplus[0] = after.peak[0] = V(0);
+      return M(false);
+    }
+    const int n = plan.nv;
+    const V h = b.dt, half(0.5);
+    for (int i = 0; i < n; i++) total[i] = fma(half, before.steady[i], before.v[i]);
+    const V first = momenta.kinetic(b.start, b.start_axes, total);
+    for (int i = 0; i < n; i++) total[i] = fma(half, after.steady[i], after.v[i]);
+    const V last = momenta.kinetic(b.now, b.axes, total);
+    V work(0), spurious(0), turned(0);
+    for (int i = 0; i < n; i++) {
+      work = fma(h * (rough[i] + smooth[i]), after.average[i], work);
+      spurious = fma(h * b.residual[i], after.average[i], spurious);
+      turned = max(turned, abs(h * after.average[i]) * V(plan.turns[i]));
+    }
+    V lost(0), flattest(1);
+    for (int k = 0; k < plan.nodes; k++) {
+      V x[D], x0[D], middle[D * D];
+      times<D>(b.now.rotation + D * D * k, plan.center + D * k, x), times<D>(b.start.rotation + D * D * k, plan.center + D * k, x0);
+      for (int i = 0; i < D; i++) {
+        const V fell = (x[i] + b.now.position[D * k + i]) - (x0[i] + b.start.position[D * k + i]);
+        lost = fma(V(plan.mass[k]) * V(plan.gravity[i]), fell, lost);
+      }
+      for (int i = 0; i < D * D; i++) middle[i] = half * (b.now.rotation[D * D * k + i] + b.start.rotation[D * D * k + i]);
+      flattest = min(flattest, determinant<D>(middle));
+    }
+    const V falls = falling_energy(plan, h), energy = last - first - lost - work;
+    const V peak = max(before.peak[0], max(first, last) + falls), sum = max(before.surplus[0] + energy, V(-RESERVE) * peak);
+    after.gained[0] = energy, after.peak[0] = peak, after.surplus[0] = sum;
+    const V whole_energy = first + last + falls, gained = energy - spurious, surplus = sum - spurious;
+    const M excess = (energy > V(EXCESS) * whole_energy) & (gained > V(EXCESS) * whole_energy);
+    const M overdrawn = (sum > surplus_allowed * peak) & (energy > V(NOISE) * peak) & (surplus > surplus_allowed * peak) &
+                        (gained > V(NOISE) * peak);
+    return on_chord & ((flattest < V(FLATTEST)) | (turned > V(FARTHEST)) | excess | overdrawn);
   }
 
   // The share of smooth forces that comes early.

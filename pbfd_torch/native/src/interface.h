@@ -80,6 +80,38 @@ PBFD_FUNCTION void pbfd_energy_momentum(const pbfd_plan*, const pbfd_steps*, voi
 PBFD_FUNCTION void pbfd_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_bdf2(const pbfd_plan*, const pbfd_steps*, void* room);  // in space only
 
+// Steps followed back, in double precision. Arrays as in `pbfd_steps`:
+//   given, control: what the steps were given, `found`: the states after each, [steps, …];
+//   detour: [steps, worlds] which row of `halved`, `eased` and `ends` (see `pbfd_steps`) says how a step was made, −1: as itself;
+//   constant: [steps, worlds] not 0 where a step's end counts as a constant, or null; dropped: so does that of one whose J is singular;
+//   refined: the ends were found in single precision, and one of Newton's steps improves them;
+//   cotangent: [rows, worlds, …] derivatives by the last state, which become those by what was given;
+//   seen: [steps, worlds, …] of derivatives by the states after each step, to be added to these, or null;
+//   by_control: [rows, steps, worlds, nu] becomes the derivatives by controls; singular: [steps, worlds] where J is. Several rows
+//   are for one step;
+//   by_number: [worlds, numbers of the plan] and by_dt: [worlds], to which those by these are added, or null; of one row.
+struct pbfd_descent {
+  const void* dt;
+  int alike, halvings, worlds, first, last, steps, rows, held, refined, dropped;
+  double share, jump;
+  const void *given[10], *found[10];
+  const void* control;
+  const void* own;
+  const void* poses;
+  int timed;
+  const int *detour, *halved, *eased;
+  const void* ends;
+  const int* constant;
+  void* cotangent[10];
+  const void* seen[10];
+  void *by_control, *by_number, *by_dt;
+  int* singular;
+};
+
+PBFD_FUNCTION void pbfd_energy_momentum_back(const pbfd_plan*, const pbfd_descent*, void* room);
+PBFD_FUNCTION void pbfd_implicit_euler_back(const pbfd_plan*, const pbfd_descent*, void* room);
+PBFD_FUNCTION void pbfd_bdf2_back(const pbfd_plan*, const pbfd_descent*, void* room);
+
 // States at t = 0 of worlds that are given by q, v and one control, found as after one step. What is reported is the trial step.
 PBFD_FUNCTION void pbfd_start_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
 PBFD_FUNCTION void pbfd_start_implicit_euler(const pbfd_plan*, const pbfd_steps*, void* room);

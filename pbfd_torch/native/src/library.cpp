@@ -1,6 +1,8 @@
 // The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
 #include <algorithm>
+#include <cstring>
 
+#include "adjoint.h"
 #include "finding.h"
 #include "given.h"
 #include "inspection.h"
@@ -10,7 +12,7 @@
 
 using namespace pbfd;
 
-int pbfd_interface() { return 14; }
+int pbfd_interface() { return 15; }
 
 int pbfd_lanes(int bytes) { return register_bytes / bytes; }
 
@@ -150,6 +152,29 @@ void record_by(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, v
   (p->bytes == 8 ? record_of<Scheme, double> : record_of<Scheme, float>)(p, r, a, room);
 }
 
+// Steps of a scheme followed back.
+template <int D, template <class, class, int> class Scheme> void back_of(const pbfd_plan* p, const pbfd_descent* d, void* room) {
+  using L = Lanes<double, register_bytes / 8>;
+  using Followed = Adjoint<L, D, Scheme>;
+  const Descent<double> of = {
+      d->worlds, d->steps, d->rows, d->halvings, d->held != 0, d->alike != 0, d->refined != 0, d->dropped != 0,
+      static_cast<const double*>(d->dt), d->given, d->found, static_cast<const double*>(d->control), timetable<double>(p, d),
+      d->detour, d->halved, d->eased, static_cast<const double*>(d->ends), d->constant, d->cotangent, d->seen,
+      static_cast<double*>(d->by_control), static_cast<double*>(d->by_number), static_cast<double*>(d->by_dt), d->singular};
+  const Rules rules = {0, HUGE_VAL, d->share, d->jump, d->halvings, 0, 0, 0, 0};
+  with_each<L, D>(p, d->own, {static_cast<L*>(room)}, [&](const Plan<L, D>& plan, Numbers<L>& own, const L*, Arena<L>& arena) {
+    Arena<Traced<L>> written{reinterpret_cast<Traced<L>*>(arena.next + Followed::room(plan))};
+    std::memset(static_cast<void*>(written.next), 0, Followed::written_room(plan) * sizeof(Traced<L>));  // nothing there is a node
+    Followed(p, plan, own, arena, written).run(of, rules, d->first, d->last);
+  });
+}
+
+template <template <class, class, int> class Scheme> long room_back(Sizes s) {
+  using L = Lanes<double, register_bytes / 8>;
+  using Followed = Adjoint<L, 3, Scheme>;
+  return (Plan<L, 3>::real_numbers(s) + Followed::room(s)) * long(sizeof(L)) + Followed::written_room(s) * long(sizeof(Traced<L>));
+}
+
 // Room for lanes V, in V; a plane needs less.
 template <class V> int room_of(Sizes s) {
   using First = EnergyMomentum<V, V, 3>;
@@ -176,7 +201,8 @@ long pbfd_room(const pbfd_plan* p) {
   using Wide = Lanes<double, register_bytes / 8>;
   using Narrow = Lanes<float, register_bytes / 4>;
   const int wide = room_of<Wide>(sizes(p)), narrow = room_of<Narrow>(sizes(p));
-  return long(register_bytes) * (wide > narrow ? wide : narrow);
+  return std::max({long(register_bytes) * std::max(wide, narrow), room_back<EnergyMomentum>(sizes(p)),
+                   room_back<ImplicitEuler>(sizes(p)), room_back<Bdf2>(sizes(p))});
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<EnergyMomentum>>(p, s, room); }
@@ -184,6 +210,16 @@ void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
 void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<ImplicitEuler>>(p, s, room); }
 
 void pbfd_bdf2(const pbfd_plan* p, const pbfd_steps* s, void* room) { in_space<Going<Bdf2>>(p, s, room); }
+
+void pbfd_energy_momentum_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
+  p->dimension == 3 ? back_of<3, EnergyMomentum>(p, d, room) : back_of<2, EnergyMomentum>(p, d, room);
+}
+
+void pbfd_implicit_euler_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
+  p->dimension == 3 ? back_of<3, ImplicitEuler>(p, d, room) : back_of<2, ImplicitEuler>(p, d, room);
+}
+
+void pbfd_bdf2_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { back_of<3, Bdf2>(p, d, room); }
 
 void pbfd_start_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   make_by<Starting<EnergyMomentum>>(p, s, room);

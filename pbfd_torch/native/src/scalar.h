@@ -29,6 +29,8 @@ template <class V> struct Kind {
   using Mask = bool;
   static constexpr int lanes = 1;
 };
+// Whether it is a number that derivatives are followed back from (traced.h), so that nobody asks for slopes beside it.
+template <class V> constexpr bool derived = false;
 // What one lane holds, and putting something there.
 inline double lane(double value, int) { return value; }
 inline float lane(float value, int) { return value; }
@@ -68,6 +70,7 @@ template <class T, int W> struct Lanes {
   friend Mask<T, W> operator<=(Lanes a, Lanes b) { return Mask<T, W>(a.v <= b.v); }
   friend Mask<T, W> operator>(Lanes a, Lanes b) { return Mask<T, W>(a.v > b.v); }
   friend Mask<T, W> operator>=(Lanes a, Lanes b) { return Mask<T, W>(a.v >= b.v); }
+  friend Mask<T, W> operator!=(Lanes a, Lanes b) { return Mask<T, W>(a.v != b.v); }
 };
 
 template <class T, int W> struct Kind<Lanes<T, W>> {
@@ -83,6 +86,12 @@ template <class T, int W> inline void put(Mask<T, W>& mask, int i, bool value) {
 
 template <class T, int W> inline Lanes<T, W> select(Mask<T, W> which, Lanes<T, W> a, Lanes<T, W> b) {
   return Lanes<T, W>(which.bits ? a.v : b.v);
+}
+
+// Where `all` is −1 the numbers, where it is 0 zeros.
+template <class T, int W> inline Lanes<T, W> kept(Lanes<T, W> x, int all) {
+  using Bits = typename Mask<T, W>::Bits;
+  return Lanes<T, W>((decltype(x.v))((Bits)x.v & (all - Bits{})));
 }
 
 template <class T, int W> inline bool any(Mask<T, W> mask) {

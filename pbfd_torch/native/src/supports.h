@@ -34,7 +34,7 @@ struct Ball {
   template <bool FLAT, class V, int D> static void arm(V radius, const V* n, const V* bend, Arm<V, D>& out) {
     const V back = -radius;
     for (int j = 0; j < D; j++) out.s[j] = back * n[j];
-    if constexpr (!FLAT)
+    if constexpr (!FLAT && !derived<V>)
       for (int j = 0; j < D * D; j++) out.by_shift[j] = back * bend[j];
   }
 };
@@ -64,14 +64,19 @@ struct Ellipsoid {
     arm<FLAT>(M, n, bend, out);
   }
   template <bool FLAT, class V> static void arm(const V* M, const V* n, const V* bend, Arm<V, 3>& out) {
-    V y[3], lean[3];
+    V y[3];
     times(M, n, y);
     const V h = sqrt(max(dot(n, y), V(POINT * POINT))), per = V(1) / h;
     const auto solid = h > V(POINT);
     out.reach = h;
     for (int j = 0; j < 3; j++) out.s[j] = select(solid, -(y[j] * per), V(0));
+    if constexpr (!derived<V>) slope<FLAT>(M, n, bend, y, per, out);
+  }
+  // How both answer.
+  template <bool FLAT, class V> static void slope(const V* M, const V* n, const V* bend, const V* y, V per, Arm<V, 3>& out) {
+    V lean[3];
     // δy = ω × y − M (ω × n) + M B w,  δh = (ω · (y × n) + y · B w)/h,  δs = (y δh/h − δy)/h
-    auto slope = [&](const V* spreads, V reaches, V* column) {
+    auto steer = [&](const V* spreads, V reaches, V* column) {
       for (int j = 0; j < 3; j++) column[3 * j] = fma(y[j] * per, reaches, -spreads[j]) * per;
     };
     cross(y, n, lean);
@@ -83,7 +88,7 @@ struct Ellipsoid {
       times(M, beside, spreads);
       for (int j = 0; j < 3; j++) spreads[j] = spreads[j] - Y[3 * j + b];
       out.reach_by_turn[b] = lean[b] * per;
-      slope(spreads, out.reach_by_turn[b], out.by_turn + b);
+      steer(spreads, out.reach_by_turn[b], out.by_turn + b);
     }
     if constexpr (!FLAT)
       for (int b = 0; b < 3; b++) {
@@ -91,7 +96,7 @@ struct Ellipsoid {
         V spreads[3];
         times(M, tilt, spreads);
         out.reach_by_shift[b] = dot(y, tilt) * per;
-        slope(spreads, out.reach_by_shift[b], out.by_shift + b);
+        steer(spreads, out.reach_by_shift[b], out.by_shift + b);
       }
   }
 

@@ -15,7 +15,14 @@ template <bool FLAT, class V> [[gnu::noinline]] void resist_spin(const Touching<
   t.relaxed->felt(pressed, push, rises);
   const V y = dot(t.turn, n);
   slip_law(abs(y), t.law->per_turn, factor, falls);
-  const V limit = t.law->patch * push, torque = limit * factor * y, fades = t.law->patch * rises * factor * y;
+  const V limit = t.law->patch * push, torque = limit * factor * y;
+
+  out.open();
+  // as if of forces on material points, with the moment −½[τ]×; a torque answers ½[τ]× less
+  const V turned[9] = {V(0), -n[2], n[1], n[2], V(0), -n[0], -n[1], n[0], V(0)}, moment = half * torque;
+  for (int a = 0; a < 9; a++) out.moment[a] = fma(moment, turned[a], out.moment[a]);
+  if constexpr (derived<V>) return;
+  const V fades = t.law->patch * rises * factor * y;
   const V stiffens = limit * fma(falls * y, y, factor);
 
   transposed_times(t.rolling, n, turns);
@@ -28,14 +35,10 @@ template <bool FLAT, class V> [[gnu::noinline]] void resist_spin(const Touching<
     for (int a = 0; a < 3; a++) shifts[3 * a + b] = FLAT ? n[a] * grows : fma(torque, t.bend[3 * a + b], n[a] * grows);
   }
 
-  out.open();
-  // as if of forces on material points, with the moment −½[τ]×; a torque answers ½[τ]× less
-  const V turned[9] = {V(0), -n[2], n[1], n[2], V(0), -n[0], -n[1], n[0], V(0)}, moment = half * torque;
   for (int a = 0; a < 3; a++) {
     V *row = out.stiffness + 6 * a, beside[3];
     lever<3>(t.center, shifts + 3 * a, beside);
     for (int b = 0; b < 3; b++) {
-      out.moment[3 * a + b] = fma(moment, turned[3 * a + b], out.moment[3 * a + b]);
       row[b] += fma(n[a] * stiffens, turns[b], fma(moment, turned[3 * a + b], beside[b]));
       row[3 + b] += shifts[3 * a + b];
     }

@@ -53,12 +53,11 @@ template <class Support, class V, int D> inline void force(const Touching<V, D>&
   for (int j = 0; j < D; j++) out.f[j] = fma(out.push, n[j], -(out.grasp.drag * out.u[j]));
 }
 
-// `FLAT`: the normal does not turn, and the depth is the distance itself.
-template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press(const Touching<V, D>& t, Push<V, D>& out) {
+// How the force answers. `FLAT`: the normal does not turn, and the depth is the distance itself.
+template <bool FLAT, class Support, class V, int D>
+[[gnu::always_inline]] inline void stiffen(const Touching<V, D>& t, const Force<V, D>& at, Push<V, D>& out) {
   constexpr int T = turns(D), S = T + D;
   const V zero(0), *n = t.solid.normal, *s = t.arm.s, *c = t.center;
-  Force<V, D> at;
-  force<Support>(t, at);
   const V *m = at.m, *u = at.u, *p = at.p, *f = at.f, lifted = at.lifted, push = at.push, rises = at.rises, drag = at.grasp.drag;
   const V by_depth = at.grasp.by_depth, by_size = at.grasp.by_size, lifts = at.grasp.lift_by_size;
 
@@ -122,11 +121,6 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
     }
   }
 
-  out.open();
-  for (int j = 0; j < D; j++) {
-    out.force[j] -= f[j];
-    for (int b = 0; b < D; b++) out.moment[D * j + b] = fma(-f[j], p[b], out.moment[D * j + b]);
-  }
   for (int j = 0; j < S; j++) {  // w = v + ω × c
     V *row = out.stiffness + S * j, turned[T];
     const V* shift = by_shift + D * j;
@@ -136,6 +130,17 @@ template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press
     if constexpr (Support::rolls)
       for (int b = 0; b < T; b++) row[b] += by_turn[T * j + b];
   }
+}
+
+template <bool FLAT, class Support, class V, int D> [[gnu::noinline]] void press(const Touching<V, D>& t, Push<V, D>& out) {
+  Force<V, D> at;
+  force<Support>(t, at);
+  out.open();
+  for (int j = 0; j < D; j++) {
+    out.force[j] -= at.f[j];
+    for (int b = 0; b < D; b++) out.moment[D * j + b] = fma(-at.f[j], at.p[b], out.moment[D * j + b]);
+  }
+  if constexpr (!derived<V>) stiffen<FLAT, Support>(t, at, out);
 }
 
 }  // namespace pbfd
