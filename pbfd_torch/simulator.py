@@ -17,6 +17,7 @@ from pbfd_torch.gradients.linearization import Linearization, linearized
 from pbfd_torch.gradients.linked import Linked
 from pbfd_torch.gradients.parts import Carriers
 from pbfd_torch.gradients.trajectory import Trajectory, trajectory
+from pbfd_torch.gradients.walks import stepped
 from pbfd_torch.integrators.integrator import Integrator, Leaping, S
 from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.native.engine import Engine, chosen
@@ -187,8 +188,7 @@ class Simulator(Generic[S]):
         if self._carriers().may_carry(*vars(state).values(), *state.memory, control):
             linked = Linked(self.eager, self.gradients, self._maker)
             if linked.carry(state, control):
-                advanced, made = linked.step(state, control)
-                return advanced, made.solution
+                return stepped(linked, state, control)
         advanced, solution, _ = self.stepper.made(state, control)
         return advanced, solution
 

@@ -14,10 +14,11 @@ from pbfd_torch.balance.dynamics import mass_matrix
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum, Velocities
 from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator, S, State, fresh
-from pbfd_torch.native.stepper import NativeStepper, spread
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.objective import Solution, Status
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.shapes import spread
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.tree.kinematics import difference
 

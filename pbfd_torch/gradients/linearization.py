@@ -17,7 +17,10 @@ from pbfd_torch.gradients.linked import Engine, complain, doubts_of
 from pbfd_torch.gradients.parts import precise
 from pbfd_torch.integrators.integrator import Integrator, S
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.solvers.per_world import mapped
+from pbfd_torch.stepping.descending import Descending
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.stepping.stepper import Stepper
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.tree.articulation import Articulation
@@ -89,6 +92,13 @@ class Chart(Generic[S]):
         wide: S = mapped_tensors(self.state, lambda value: value.expand(*copies, *value.shape))
         return replaced(wide, **changes)
 
+    @property
+    def rows(self) -> Tensor:
+        """A derivative by each coordinate, of copies of the batch `[nx, *batch, nx]`."""
+        eye = torch.eye(self.size, dtype=self.state.q.dtype, device=self.state.q.device)
+        batch = self.state.time.shape
+        return eye.reshape(self.size, *(1,) * len(batch), self.size).expand(self.size, *batch, self.size)
+
     def of(self, state: S) -> Tensor:
         """The coordinates of a state."""
         found = [difference(self._articulation, getattr(self.state, name), getattr(state, name)) for name in self._configurations]
@@ -103,9 +113,54 @@ def linearized(
     stepper: EagerStepper[S], gradients: Gradients, engine: Engine, state: S, control: Tensor | None
 ) -> Linearization[S]:
     """See `Simulator.linearize`."""
+    maker = engine(stepper)
+    if isinstance(maker, Descending) and maker.descends and gradients.blur is None:
+        end, solution, singular, A, B = _pulled(maker, engine, stepper, gradients, state, control)
+    else:
+        end, solution, singular, A, B = _retraced(maker, stepper, gradients, state, control)
+    policy = gradients.doubtful
+    doubts = doubts_of(solution.status) | int(Doubt.SINGULAR) * singular.int()
+    complain(policy, doubts, state.time)
+    lost = (doubts & int(Doubt.UNSOLVED | Doubt.SINGULAR)) > 0 if policy is Doubtful.ZERO else torch.zeros_like(doubts) > 0
+    A, B = (torch.where(lost[..., None, None], 0.0, g.movedim(0, -2)).to(state.q.dtype) for g in (A, B))
+    return Linearization(A, B, end, solution, doubts)
+
+
+_Rows = tuple[S, Solution, Tensor, Tensor, Tensor]
+"""The end of a step, how it was solved, where J is singular `[*batch]`, and the rows of A and B, `[nx, *batch, nx or nu]`."""
+
+
+def _pulled(
+    maker: Descending[S], engine: Engine, stepper: EagerStepper[S], gradients: Gradients, state: S, control: Tensor | None
+) -> _Rows[S]:
+    """By the engine that makes the step: one call for all rows."""
+    wide = precise(stepper)
+    back = maker if wide is stepper else engine(wide)
+    assert isinstance(back, Descending)
+    walked = maker.walk(state, None if control is None else control.detach()[None], 1)
+    states = maker.restored(state, walked.found, walked.other)
+    end, solution = (mapped(lambda x: x[0], x) for x in (states, walked.solution))
+    before, after = (Chart(wide, in_dtype(x, torch.float64)) for x in (state, end))
+    fields = {name: x[0].double() for name, x in walked.found.items()}
+    seen = {name: x.expand(after.size, *x.shape).clone().requires_grad_() for name, x in fields.items()}
+    other = {name: x[0].expand(after.size, *x.shape[1:]) for name, x in walked.other.items()}
+    x = before.state.q.new_zeros((after.size, *state.time.shape, before.size), requires_grad=True)
+    with torch.enable_grad():
+        rows = after.of(back.restored(after.state, seen, other))
+        set_out = back.fields(before.at(x))
+    # the coordinates by the fields after the step, these by those before it, and these by the coordinates
+    found = torch.autograd.grad(rows, list(seen.values()), after.rows, allow_unused=True, materialize_grads=True)
+    last = dict(zip(seen, found, strict=True))
+    pulled = back.back(walked.path, {}, last, dropped=gradients.doubtful is Doubtful.ZERO)
+    reached = [(y, pulled.start[name]) for name, y in set_out.items() if y.requires_grad]
+    (A,) = torch.autograd.grad([y for y, _ in reached], x, [by for _, by in reached])
+    return end, solution, pulled.singular[0], A, pulled.control[:, 0]
+
+
+def _retraced(maker: Stepper[S], stepper: EagerStepper[S], gradients: Gradients, state: S, control: Tensor | None) -> _Rows[S]:
+    """By PyTorch, along the way that the step was made."""
     nu = stepper.scene.nu
-    end, solution, way = engine(stepper).made(state, control)
-    doubts = doubts_of(solution.status)
+    end, solution, way = maker.made(state, control)
     wide = precise(stepper)
     before, after = (Chart(wide, in_dtype(x, torch.float64)) for x in (state, end))
     # one copy of the batch for every coordinate of the end: a single pass back gives a row of A and B each
@@ -116,12 +171,5 @@ def linearized(
     with torch.enable_grad():
         reached, singular = followed(wide, before.at(x), u if nu else None, way.repeated(after.size), gradients.blur)
         rows = after.of(reached)
-    seed = torch.eye(after.size, dtype=x.dtype, device=x.device)
-    seed = seed.reshape(after.size, *(1,) * state.time.ndim, after.size).expand_as(rows)
-    found = torch.autograd.grad(rows, (x, u), seed, allow_unused=True, materialize_grads=True)
-    policy = gradients.doubtful
-    doubts = doubts | int(Doubt.SINGULAR) * singular[0].int()
-    complain(policy, doubts, state.time)
-    lost = (doubts & int(Doubt.UNSOLVED | Doubt.SINGULAR)) > 0 if policy is Doubtful.ZERO else torch.zeros_like(doubts) > 0
-    A, B = (torch.where(lost[..., None, None], 0.0, g.movedim(0, -2)).to(state.q.dtype) for g in found)
-    return Linearization(A, B, end, solution, doubts)
+    A, B = torch.autograd.grad(rows, (x, u), after.rows, allow_unused=True, materialize_grads=True)
+    return end, solution, singular[0], A, B

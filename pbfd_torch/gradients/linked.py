@@ -25,6 +25,8 @@ from pbfd_torch.stepping.way import Way
 from pbfd_torch.tensors.plain import carries, plain, wrapped
 from pbfd_torch.tensors.structures import in_dtype, mapped_tensors, tensors_of
 
+NO_SECOND = "steps have first derivatives only: use torch.autograd.grad without create_graph, or torch.func.jvp"
+
 
 def doubts_of(status: Tensor) -> Tensor:
     """The bits of `Doubt` that are known from values of `Status`."""
@@ -299,9 +301,7 @@ class _Implicit(torch.autograd.Function):
     @staticmethod
     def backward(ctx: _Context, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # as with create_graph=True, and in torch.func's backward transforms
-            raise GradientError(
-                "steps have first derivatives only: use torch.autograd.grad without create_graph, or torch.func.jvp"
-            )
+            raise GradientError(NO_SECOND)
         needed = ctx.needs_input_grad[1:]
         with torch.enable_grad():
             values = [x.detach().requires_grad_(need) for x, need in zip(ctx.saved_tensors, needed, strict=True)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, cast
 
 import torch
 from torch import Tensor
@@ -16,11 +16,15 @@ from torch import Tensor
 from pbfd_torch.errors import InputError
 from pbfd_torch.gradients.implicit import Gradients
 from pbfd_torch.gradients.linked import Engine, Linked, Made, Play, doubts_of
+from pbfd_torch.gradients.walks import Walk, Walker
 from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import is_solved
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.tensors.plain import carries
 from pbfd_torch.tensors.structures import tensors_of
+
+AT_ONCE = 16384  # steps of worlds that are one node, so that progress is told of now and then
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +42,7 @@ class Trajectory(Generic[S]):
     v: Tensor
     end: S
     status: Tensor
-    _made: tuple[Sequence[Made], ...] = ()  # those of a checkpoint's steps once they were retraced
+    _made: tuple[Sequence[Made] | Walk, ...] = ()  # those of a checkpoint's steps once they were retraced
 
     @property
     def solved(self) -> Tensor:
@@ -50,7 +54,7 @@ class Trajectory(Generic[S]):
         """`[T, *batch]` bits of `Doubt`: what may be wrong with the derivatives of each step. Singular ones are known once
         derivatives were asked for."""
         known = doubts_of(self.status)
-        found = [made.doubts for some in self._made for made in some]
+        found = [x for some in self._made for x in (some.doubts if isinstance(some, Walk) else [made.doubts for made in some])]
         return known if len(found) < len(known) else known | torch.stack(found)
 
 
@@ -109,13 +113,21 @@ def trajectory(
     given = tensors_of([state, controls, *linked.leaves])
     if any(carries(x) and not x.requires_grad for x in given):
         checkpoint = 1  # forward derivatives keep nothing, so there is nothing to save
+    walker = Walker.of(linked, state, controls) if carrying else None
     q, v = [state.q[None]], [stepper.integrator.velocity(stepper.articulation, state, stepper.step_size)[None]]
     status: list[Tensor] = []
-    kept: list[Sequence[Made]] = []
-    for k in range(0, count, checkpoint):
-        size = min(checkpoint, count - k)
+    kept: list[Sequence[Made] | Walk] = []
+    length = checkpoint if walker is None or checkpoint > 1 else max(1, AT_ONCE // max(1, state.time.numel()))
+    for k in range(0, count, length):
+        size = min(length, count - k)
         held = None if controls is None else controls[k : k + size]
-        if carrying and checkpoint > 1:
+        if walker is not None:
+            reached, walk = walker.walk(state, held, size, kept=checkpoint == 1)
+            seen = [reached.q, stepper.integrator.velocity(stepper.articulation, reached, stepper.step_size)]
+            state = cast(S, mapped(lambda x: x[-1], reached))
+            status += walk.solution.status
+            kept.append(walk)
+        elif carrying and checkpoint > 1:
             segment = _Segment(linked, state, held, size)
             *seen, state = segment.perform(state, held)
             status += segment.status

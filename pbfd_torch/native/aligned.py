@@ -11,7 +11,7 @@ from pbfd_torch.tree.articulation import Articulation, homogeneous
 
 def aligned(a: Articulation) -> Articulation:
     """The same tree with nodes turned by constants, so that hinges turn about the node's z, and slides move along it: by those of
-    each world where the worlds' frames differ."""
+    each world where the worlds' frames differ. Frames and axes that carry derivatives keep them."""
     t, eye = a.topology, torch.eye(3, dtype=a.dtype)[None]
     z = eye[..., 2]
     frames: list[Tensor] = []
@@ -22,7 +22,7 @@ def aligned(a: Articulation) -> Articulation:
         if size == (1, 1):
             rotation, axis = frame[..., :3, :3], a.joint_axis[..., j, None, :]
             there = (rotation[..., 2, :] - axis).abs().amax(-1) <= 4.0 * torch.finfo(a.dtype).eps
-            as_parent = there[..., None, None]
+            as_parent = there[..., None, None] & (not (rotation.requires_grad or axis.requires_grad))  # which cannot tilt
             turn = torch.where(as_parent, rotation.mT, _turning(axis))
             frame = homogeneous(torch.where(as_parent, eye, rotation @ turn), frame[..., :3, 3])
         turns.append(turn)

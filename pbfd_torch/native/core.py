@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import ctypes
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +15,7 @@ from pbfd_torch.integrators.energy_momentum import Velocities
 from pbfd_torch.integrators.integrator import State
 from pbfd_torch.native.calls import Calls, whole
 from pbfd_torch.native.carriers import parted, passed
+from pbfd_torch.native.descent import Back, Path, Trail
 from pbfd_torch.native.library import Library
 from pbfd_torch.native.plan import Plan
 from pbfd_torch.native.schemes import ON_POSITIONS, Scheme
@@ -184,19 +186,45 @@ class Core:
         self.plan, self._scheme, self._terms = plan, scheme, terms
         self._calls = Calls(library, plan, threads)
 
-    def go(self, state: State, control: Tensor, steps: tuple[int, ...], accuracy: Accuracy | None = None) -> Journey:
+    def go(
+        self, state: State, control: Tensor, steps: tuple[int, ...], accuracy: Accuracy | None = None, led: bool = False
+    ) -> Journey:
         """Steps of all worlds from a state under controls `[steps, *batch, nu]`, or `[1, *batch, nu]` for all steps; frames of this
-        accuracy, if any. On several threads where that is worth it: worlds do not know of each other, and it makes no difference to
-        any."""
+        accuracy, if any. led: whether it is to be known how each of several was made. On several threads where that is worth it:
+        worlds do not know of each other, and it makes no difference to any."""
         given = self._scheme.fields(state, self.plan)
         found = {name: _room_for(x, steps) for name, x in given.items()}
-        ways = None if steps or accuracy else Ways(found["q"], self._terms.halvings)
+        ways = None if (steps and not led) or accuracy else Ways(found["q"], self._terms.halvings)
         frames = None if accuracy is None else Frames(accuracy, self._wish(state), found)
         poses = self._poses(state.time, math.prod(steps))
         journey = Journey(given, found, control, steps, self.plan.own, poses, ways, frames)
         asked = journey.call(self._terms)
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
+
+    def path(self, journeys: list[Journey]) -> Path:
+        """Journeys, each of which goes on from the end of the last one, as steps that may be followed back."""
+        first = journeys[0]
+        found = {name: torch.cat([x.found[name] for x in journeys]) for name in first.found}
+        trails = [Trail.of(x.ways) for x in journeys if x.ways is not None]
+        control = first.control if len(journeys) == 1 else torch.cat([x.control for x in journeys])
+        poses = torch.cat([first.poses, *(x.poses[1:] for x in journeys[1:])])
+        return Path(first.given, found, control, poses, Trail.joined(trails))
+
+    def back(
+        self, path: Path, back: Back, seen: Mapping[str, Tensor | None], constant: Tensor | None = None, dropped: bool = False
+    ) -> None:
+        """Follows a path back, of a core of double precision. seen: derivatives by its fields after each step. constant: `[steps,
+        *batch]`, whose ends count as constants; dropped: so do those with a singular J."""
+        asked = back.call(path, seen, constant, dropped)
+        terms = self._terms
+        alike = terms.dt.ndim == 0
+        dt = terms.dt if alike else whole(terms.dt, tuple(path.given["q"].shape[:-1]))
+        asked.dt, asked.alike, asked.halvings = dt.data_ptr(), alike, terms.halvings
+        asked.share, asked.jump = terms.share, terms.jump
+        own = whole(self.plan.own, (*path.given["q"].shape[:-1], self.plan.own.shape[-1]))
+        asked.own = own.data_ptr()
+        self._calls.share(f"{self._scheme.function}_back", asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
 
     def start(self, q: Tensor, v: Tensor, control: Tensor) -> tuple[Journey, Tensor]:
         """The fields of the states at t = 0 of all worlds at q `[*batch, nq]` with v `[*batch, nv]` under a control `[1, *batch,

@@ -22,6 +22,7 @@ from pbfd_torch.native.plan_torsion import torsions
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
 from pbfd_torch.terms.body_contact import BodyContact
@@ -87,6 +88,18 @@ def planned(stepper: EagerStepper[Any]) -> Plan:
 def planned_in_space(stepper: EagerStepper[Any]) -> Plan:
     """The plan of a scene that the core knows, in space."""
     return _parts(stepper).plan()
+
+
+def planned_with_derivatives(stepper: EagerStepper[Any]) -> Plan | None:
+    """The plan of a scene that the core knows, in space, whose `real` and `own` are functions of all in the stepper that carries
+    derivatives; None: something does that has no place among them, or of which the core has none."""
+    with torch.enable_grad():
+        parts = _parts(stepper)
+        plan = parts.plan()
+    hidden = [plan.sample, *parts.candidates.laws.constants, *tensors_of(plan.carriers.each)]
+    if _free(parts.a):  # they move along the world's axes, whatever their frames
+        hidden.append(stepper.articulation.joint_frame)
+    return None if any(x.requires_grad for x in hidden) else plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +176,9 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
     a = aligned(stepper.articulation)
     t, known = a.topology, _Terms(stepper, a)
     felt = felt_inertia(stepper.articulation, stepper.scene.terms)
-    joints = [_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), t.turns.to(a.dtype), felt]
+    # what tells how exact a step must be: no motion depends on it
+    measures = [x.detach() for x in (_each(stepper.scale, t.nv), _each(force_scale(a, 1.0), t.nv), reach(a)[..., None])]
+    joints = [*measures[:2], t.turns.to(a.dtype), felt]
     joints += [known.spring, known.damping, known.armature, known.dry, a.lower, a.upper, known.limit, known.rest]
     driven: list[int] = []
     if (act := known.actuators) is not None:
@@ -180,7 +195,7 @@ def _parts(stepper: EagerStepper[Any]) -> _Parts:
         driven=driven,
         pushed=known.pushed,
         joints=joints,
-        scene=[reach(a)[..., None], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
+        scene=[measures[2], a.rest.new_tensor([known.limit_release, known.limit_per_force, known.dry_speed])],
         pushes=[x[k].flatten(-2) for k in range(2) for x in known.pushes],
         memory=_memory(stepper.scene.terms, known.candidates.anchors, bodies),
     )
@@ -223,9 +238,13 @@ def _require_covered(stepper: EagerStepper[Any]) -> None:
         raise unknown(f"device {a.device.type}")
     if not isinstance(stepper.evaluations, int):
         raise unknown("evaluations of its own for each world")
-    free = [j for j, size in enumerate(a.topology.joint_sizes) if size == (7, 6)]
-    if not bool((a.joint_frame[..., free, :, :] == torch.eye(4, dtype=a.dtype)).all()):
+    if not bool((a.joint_frame[..., _free(a), :, :] == torch.eye(4, dtype=a.dtype)).all()):
         raise unknown("a free joint that does not move along the world's axes")
+
+
+def _free(a: Articulation) -> list[int]:
+    """The free joints."""
+    return [j for j, size in enumerate(a.topology.joint_sizes) if size == (7, 6)]
 
 
 def _plain(frames: Tensor) -> list[int]:

@@ -23,6 +23,7 @@ from pbfd_torch.tree.articulation import Articulation
 
 COULOMB, STATIC, PAPER, GRADIENT = range(4)  # anchored friction is Coulomb's with a memory
 PATCH = 7  # which of the particulars ℓμ is
+CONSTANT = (0, 1, 2, 5, 6)  # which of them the core has no derivatives by: exponents, and restitution
 USUAL = -1  # the law C d² with Coulomb's friction, of which most contacts are: it has no row
 
 
@@ -37,6 +38,11 @@ class Laws:
     def real(self) -> Sequence[Tensor]:
         """The numbers."""
         return [x for row in self.rows for x in row]
+
+    @property
+    def constants(self) -> list[Tensor]:
+        """Those that the core has no derivatives by."""
+        return [row[k] for row in self.rows for k in CONSTANT]
 
     def number(self, law: Law, i: int) -> int:
         """Adds that of one of the candidates or pairs of a contact; its number."""

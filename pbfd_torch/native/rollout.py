@@ -7,8 +7,9 @@ from collections.abc import Callable
 from torch import Tensor
 
 from pbfd_torch.integrators.integrator import S
-from pbfd_torch.native.stepper import NativeStepper, spread
+from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.records.rollout import Rollout
+from pbfd_torch.tensors.shapes import spread
 
 AT_ONCE = 4096  # steps of worlds: what is recorded in one go is in the processor's cache, and an interruption need not wait
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property, partial
 from typing import Any, Generic, cast
 
@@ -20,20 +20,26 @@ from pbfd_torch.integrators.runge_kutta import RungeKutta
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.native.carriers import passed
 from pbfd_torch.native.core import Core, Journey, Terms
+from pbfd_torch.native.descent import Back, Path
 from pbfd_torch.native.library import library, reason
 from pbfd_torch.native.not_compiled import NotCompiledError, unknown
-from pbfd_torch.native.plan import Plan, planned
+from pbfd_torch.native.plan import Plan, planned, planned_with_derivatives
 from pbfd_torch.native.recording import Record, Writer
 from pbfd_torch.native.schemes import SCHEMES, Scheme
 from pbfd_torch.native.stretch import Stretch
 from pbfd_torch.scene import Scene
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Solution
+from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.accuracy import Accuracy
+from pbfd_torch.stepping.descending import Numbers, Pulled, Walked
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Way
+from pbfd_torch.tensors.shapes import spread
 from pbfd_torch.tensors.worlds import Worlds, replaced
+
+KEPT_AT_ONCE = 16384  # steps of worlds: of how many it is kept for a moment how they were made, with all that it takes
 
 
 class NativeStepper(Generic[S]):
@@ -66,6 +72,7 @@ class NativeStepper(Generic[S]):
         share = scheme.share if isinstance(scheme, Variational) else 1.0
         trust = scheme.trust if isinstance(scheme, RungeKutta) else 0.0
         jump = scheme.jump if isinstance(scheme, Bdf2) else math.inf
+        self._trust = trust
         halvings = eager.halvings
         while halvings and eager.dt / 2**halvings < SHORTEST_STEP:
             halvings -= 1
@@ -134,11 +141,75 @@ class NativeStepper(Generic[S]):
         make = partial(self._restored, state)
         return Stretch(state.time, journey.given, journey.found, other, journey.solution, journey.frames, make)
 
-    def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...]) -> Journey:
-        """The states after steps, and how these were solved."""
+    # followed back ----------------------------------------------------------------------------------------------------------
+    @property
+    def descends(self) -> bool:
+        """See `Descending`: where bodies touch each other, what they touch with follows them in a way that the core does not write
+        down, and explicit steps it follows nowhere."""
+        return not self._core.plan.bodies.rows and self._trust == 0 and self._accuracy is None
+
+    def fields(self, state: S) -> dict[str, Tensor]:
+        """See `Descending`."""
+        return self._scheme.fields(self.complete(state), self._core.plan)
+
+    def restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
+        """See `Descending`."""
+        return self._restored(state, found, other)
+
+    def precise(self, stepper: EagerStepper[S], plain: EagerStepper[S]) -> tuple[NativeStepper[S], Numbers] | None:
+        """See `Descending`."""
+        plan = planned_with_derivatives(stepper)
+        if plan is None:
+            return None
+        numbers = Numbers(plan.real, plan.own, stepper.step_size)
+        return NativeStepper(plain, self.threads, replaced(plan, real=plan.real.detach(), own=plan.own.detach())), numbers
+
+    def walk(self, state: S, controls: Tensor | None, steps: int) -> Walked:
+        """See `Descending`."""
+        start, journeys, worlds = state, list[Journey](), max(1, state.q[..., 0].numel())
+        part = max(1, KEPT_AT_ONCE // worlds)
+        for first in range(0, steps, part):
+            count = min(part, steps - first)
+            held = controls if controls is None or len(controls) == 1 else controls[first : first + count]
+            if journeys:
+                found = {name: x[-1] for name, x in journeys[-1].found.items()}
+                other = {name: x[-1] for name, x in journeys[-1].other(passed(state.time, self.step_size, part)[1:]).items()}
+                state = self._restored(state, found, other)
+            journeys.append(self._went(state, held, (count,), led=True))
+        path = self._core.path(journeys)
+        times = passed(start.time, self.step_size, steps)[1:]
+        hazards = torch.cat([x.counted["hazards"] for x in journeys])
+        solution = mapped(lambda *x: torch.cat(x), *(x.solution for x in journeys))
+        return Walked(path.found, {"time": times, "hazards": hazards}, solution, path)
+
+    def back(
+        self,
+        path: Path,
+        seen: Mapping[str, Tensor | None],
+        last: Mapping[str, Tensor] | None = None,
+        constant: Tensor | None = None,
+        dropped: bool = False,
+        numbers: bool = False,
+    ) -> Pulled:
+        """See `Descending`."""
+        plan, path = self._core.plan, path.precise()
+        back = Back(path, last, len(plan.real) if numbers else 0)
+        self._core.back(path, back, seen, constant, dropped)
+        found = None
+        if numbers:
+            assert back.numbers is not None
+            assert back.step_size is not None
+            every, which = back.numbers.reshape(-1, len(plan.real)), plan.which.long()
+            shared = every.sum(0).index_fill(0, which, 0.0)
+            own = _summed(back.numbers[..., which], plan.own)
+            found = Numbers(shared, own, _summed(back.step_size, self.step_size))
+        return Pulled(back.by, back.control, found, back.singular > 0)
+
+    def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...], led: bool = False) -> Journey:
+        """The states after steps, and how these were solved; led: and how each was made."""
         if controls is None:
             controls = state.q.new_zeros(1, self.scene.nu)
-        return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps, self._accuracy)
+        return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps, self._accuracy, led)
 
     def _restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
         """The states after steps from a state, of the core's fields and what else they have."""
@@ -192,6 +263,11 @@ class NativeStepper(Generic[S]):
         return NativeStepper(self.eager.sized(step_size), self.threads, self._core.plan, self._accuracy)
 
 
+def _summed(values: Tensor, like: Tensor) -> Tensor:
+    """Values of each world, for what may be the same for several."""
+    return values.sum_to_size(like.shape) if values.shape != like.shape else values
+
+
 def uncovered(eager: EagerStepper[Any]) -> str:
     """Why the compiled core cannot make these steps, in words; nothing where it can."""
     try:
@@ -211,11 +287,3 @@ def plan_of(eager: EagerStepper[Any]) -> Plan:
     if type(eager.integrator) not in SCHEMES:
         raise unknown(f"integrator {type(eager.integrator).__name__}")
     return planned(eager)
-
-
-def spread(controls: Tensor, batch: Sequence[int]) -> Tensor:
-    """Controls `[steps, *, nu]`, given for all worlds or for some dimensions of the batch, as `[steps, *batch, nu]`."""
-    missing = len(batch) + 2 - controls.ndim
-    if missing == 0 and controls.shape[1:-1] == batch:
-        return controls
-    return controls.reshape(len(controls), *(1,) * missing, *controls.shape[1:]).expand(len(controls), *batch, controls.shape[-1])
