@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pbfd_torch.bench.mujoco_scenes import ROBOTS, mjcf
-from pbfd_torch.bench.timing import timed
+from pbfd_torch.bench.timing import Clock, timed
 
 INTEGRATORS = ("Euler", "implicitfast", "discrete", "RK4")
 ENGINE = "mujoco"  # beside our own engines' names
@@ -25,7 +26,7 @@ class Run:
     """Attributes:
     q, v: `[steps + 1, nq]`, `[steps + 1, nv]`, the start first; NaN throughout where it diverged.
     diverged: whether MuJoCo found a bad state; it then stops.
-    seconds: wall time of the steps [s], the shortest of a few runs.
+    seconds: time of the steps [s], the shortest of a few runs, by the clock that was given.
     """
 
     q: Tensor
@@ -50,17 +51,31 @@ def absent(so: str) -> tuple[str, ...]:
 def loaded(name: str, dt: float, integrator: str, world: int = 0) -> Any:
     """The `MjModel` of a scene with step `dt` [s] and one of the `INTEGRATORS`. Contacts are as stiff as MuJoCo takes them, with a
     time constant of 2Δt and critical damping; those of the robots are as their files have them."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_string(mjcf(name, world))
-    model.opt.timestep = dt
-    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    model = model_of(mjcf(name, world), dt, integrator)
     if name not in ROBOTS:
         model.geom_solref[:] = (2 * dt, 1.0)
     return model
 
 
-def run(model: Any, q: Tensor, v: Tensor, steps: int, control: Tensor | None = None, repeats: int = 1) -> Run:
+def model_of(text: str, dt: float, integrator: str) -> Any:
+    """The `MjModel` of an MJCF text with step `dt` [s] and one of the `INTEGRATORS`."""
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(text)
+    model.opt.timestep = dt
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    return model
+
+
+def run(
+    model: Any,
+    q: Tensor,
+    v: Tensor,
+    steps: int,
+    control: Tensor | None = None,
+    repeats: int = 1,
+    clock: Clock = time.perf_counter,
+) -> Run:
     """Steps from q `[nq]` and v `[nv]`; control: `[steps, nu]`, held over each step, or None for zero. Times up to `repeats` runs,
     all in C."""
     import mujoco
@@ -77,7 +92,7 @@ def run(model: Any, q: Tensor, v: Tensor, steps: int, control: Tensor | None = N
         return rollout.rollout(model, data, start[None], controls, nstep=steps)
 
     with silent():
-        (states, _), seconds = timed(lambda: call, repeats, enough_s=0.3)
+        (states, _), seconds = timed(lambda: call, repeats, enough_s=0.3, clock=clock)
     lost = diverged(data)
     path = torch.from_numpy(np.concatenate((start[None], states[0])))  # time, q, v
     path = torch.full_like(path, torch.nan) if lost or not bool(torch.isfinite(path).all()) else path

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from pbfd_torch.cli.bench_friction import friction
+from pbfd_torch.cli.bench_gradients import gradients
 from pbfd_torch.cli.bench_hard_cases import hard_cases
 from pbfd_torch.cli.bench_precision import precision
 from pbfd_torch.cli.bench_slope import slope
@@ -46,6 +47,7 @@ bench = typer.Typer(no_args_is_help=True, help="Measures what the library does a
 bench.command()(solvers)
 bench.command()(friction)
 bench.command()(precision)
+bench.command()(gradients)
 bench.command()(speed)
 bench.command()(hard_cases)
 bench.command()(slope)
