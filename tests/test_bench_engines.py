@@ -9,7 +9,15 @@ from typing import Any
 import pytest
 
 from pbfd_torch.bench import engines, figure_5, figure_6, hard_cases
-from pbfd_torch.cli import bench_friction, bench_hard_cases, bench_precision, bench_slope, bench_soak, bench_solvers
+from pbfd_torch.cli import (
+    bench_friction,
+    bench_gradients,
+    bench_hard_cases,
+    bench_precision,
+    bench_slope,
+    bench_soak,
+    bench_solvers,
+)
 from pbfd_torch.errors import InputError
 from pbfd_torch.native.engine import Engine, Native, Torch
 from pbfd_torch.native.library import library
@@ -19,6 +27,7 @@ MODULES = {
     "solvers": bench_solvers,
     "friction": bench_friction,
     "precision": bench_precision,
+    "gradients": bench_gradients,
     "slope": bench_slope,
     "soak": bench_soak,
     "hard-cases": bench_hard_cases,

@@ -81,6 +81,7 @@ COMMANDS: dict[tuple[str, ...], tuple[list[str], dict[str, list[str]]]] = {
     ),
     ("bench", "friction"): ([], BENCH),
     ("bench", "precision"): ([], BENCH | {"--scenes": ["stack"], "--integrators": ["bdf2"]}),
+    ("bench", "gradients"): ([], BENCH | {"--problems": ["box", "toss,box"]}),
     ("bench", "hard-cases"): ([], BENCH | {"--cases": ["free-fall"], "--integrators": ["bdf2"], "--dt": ["0.01"]}),
     ("bench", "slope"): ([], BENCH | {"--duration": ["1"]}),
     ("bench", "speed"): ([], BENCH | {"--scenes": ["hopper", "stack"]}),
