@@ -27,12 +27,14 @@ sanitize: $(patsubst tests/native/%.cpp,build/sanitized/%,$(wildcard tests/nativ
 SANITIZED := $(CXX) -std=c++17 -O0 -g1 -march=native -fno-math-errno -ffp-contract=off -fno-exceptions -fno-rtti -Wall -Wextra \
 	-Wno-bitwise-instead-of-logical -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -I pbfd_torch/native/src
 
-build/sanitized/%: tests/native/%.cpp build/sanitized/library.o $(wildcard tests/native/*.h)
-	$(SANITIZED) -o $@ $< build/sanitized/library.o
+UNITS := build/sanitized/library.o build/sanitized/descent.o
 
-build/sanitized/library.o: $(NATIVE)
+build/sanitized/%: tests/native/%.cpp $(UNITS) $(wildcard tests/native/*.h)
+	$(SANITIZED) -o $@ $< $(UNITS)
+
+$(UNITS): build/sanitized/%.o: pbfd_torch/native/src/%.cpp $(NATIVE)
 	mkdir -p $(@D)
-	$(SANITIZED) -c -o $@ pbfd_torch/native/src/library.cpp
+	$(SANITIZED) -c -o $@ $<
 
 lint: .venv/.installed
 	$(BIN)/ruff check

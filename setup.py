@@ -1,6 +1,6 @@
 """Builds the native core with the C++ compiler that is there. Everything else of the installation is in pyproject.toml.
 
-The core, pbfd_torch/native/src, is compiled once per kind of processor into plain shared objects, which Python loads by ctypes:
+The core, pbfd_torch/native/src, two translation units, is compiled once per kind of processor into plain shared objects, which Python loads by ctypes:
 they know nothing of Python and torch. Where that fails the installation goes on without them, and a file keeps the reason.
 """
 
@@ -15,6 +15,7 @@ import runpy
 import shlex
 import shutil
 import subprocess
+import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -37,7 +38,7 @@ VARIANTS = {"x86_64": X86, "AMD64": X86, "arm64": ARM, "aarch64": ARM}
 FLAGS = [
     *("-std=c++17", "-O3", "-fno-tree-vectorize", "-ftree-slp-vectorize", "-fno-math-errno", "-ffp-contract=off"),
     *("-fno-exceptions", "-fno-rtti", "-Wall", "-Wextra"),
-    *("-shared", "-fPIC", "-fvisibility=hidden", "-fvisibility-inlines-hidden"),
+    *("-fPIC", "-fvisibility=hidden", "-fvisibility-inlines-hidden"),
     # GCC's bound on the growth of one translation unit would keep small functions out of line in the loops; Clang has none
     *("--param=inline-unit-growth=300", "-Wno-unused-command-line-argument"),
     "-Wno-bitwise-instead-of-logical",  # of Clang's: the mask of one world is a bool
@@ -63,18 +64,27 @@ def compiled(file: Path, flags: list[str]) -> str:
     """Compiles one variant of the core into `file`; what the compiler said against it, or nothing."""
     given = shlex.split(os.environ.get("CXXFLAGS", "")), shlex.split(os.environ.get("LDFLAGS", ""))
     strict = ["-Werror"] if STRICT else []
-    command = [*compiler(), *FLAGS, *flags, *strict, *given[0], str(SOURCES / "library.cpp"), *given[1]]
-    kept = Path(CACHE, digest(command) + ".so") if CACHE else None
+    command = [*compiler(), *FLAGS, *flags, *strict, *given[0]]
+    kept = Path(CACHE, digest([*command, *given[1]]) + ".so") if CACHE else None
     if kept is not None and kept.exists():
         shutil.copy(kept, file)
         return ""
-    try:
-        ran = subprocess.run([*command, "-o", str(file)], capture_output=True, text=True, check=False)
-    except OSError as error:
-        return f"{command[0]}: {error.strerror}"
-    if ran.returncode == 0 and kept is not None:
+    with tempfile.TemporaryDirectory() as room, ThreadPoolExecutor() as threads:
+        objects = {unit: str(Path(room, unit.stem + ".o")) for unit in sorted(SOURCES.glob("*.cpp"))}
+        said = list(threads.map(lambda unit: run([*command, "-c", str(unit), "-o", objects[unit]]), objects))
+        failure = next(filter(None, said), "") or run([*command, "-shared", *objects.values(), *given[1], "-o", str(file)])
+    if not failure and kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, kept)
+    return failure
+
+
+def run(command: list[str]) -> str:
+    """Runs it; what it said against it, or nothing."""
+    try:
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return f"{command[0]}: {error.strerror}"
     return "" if ran.returncode == 0 else f"{command[0]} failed: {ran.stderr.strip() or f'exit status {ran.returncode}'}"
 
 
@@ -157,5 +167,5 @@ class PlatformWheel(bdist_wheel):
 setup(
     cmdclass={"build_ext": BuildNative, "bdist_wheel": PlatformWheel},
     # That there is one makes the wheel one for a platform; how it is built is said above.
-    ext_modules=[Extension("pbfd_torch.native.core", [str(SOURCES / "library.cpp")])],
+    ext_modules=[Extension("pbfd_torch.native.core", sorted(map(str, SOURCES.glob("*.cpp"))))],
 )

@@ -1,8 +1,6 @@
-// The one translation unit of the core: setup.py compiles it once per kind of processor. Everything else is headers.
+// The core's functions but those that follow steps back (descent.cpp). Everything else is headers.
 #include <algorithm>
-#include <cstring>
 
-#include "adjoint.h"
 #include "finding.h"
 #include "given.h"
 #include "inspection.h"
@@ -20,10 +18,6 @@ const char* pbfd_target() { return target; }
 
 namespace {
 
-template <class T, class A> Timetable<T> timetable(const pbfd_plan* p, const A* asked) {
-  return {static_cast<const T*>(asked->poses), asked->timed, p->moving};
-}
-
 template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, const void* const* given, void* const* found) {
   auto real = [](void* array) { return static_cast<T*>(array); };
   return {s->worlds, s->steps, s->held != 0, s->alike != 0, static_cast<const T*>(s->dt), given,
@@ -34,18 +28,6 @@ template <class T> Journey<T> journey(const pbfd_plan* p, const pbfd_steps* s, c
 
 Rules rules(const pbfd_steps* s) {
   return {s->tolerance, s->surplus, s->share, s->jump, s->halvings, s->evaluations, s->accuracy, s->shortest, s->trust};
-}
-
-template <class V> Numbers<V> numbers_of(const pbfd_plan* p, const void* own, int first, int count, Arena<V>& arena) {
-  using T = typename Kind<V>::Scalar;
-  return {static_cast<const T*>(p->real), first, count, p->varied, p->which, static_cast<const T*>(own), arena};
-}
-
-// make(plan, numbers, μ, arena) with a plan whose numbers are lanes: any may be of its own for each world.
-template <class V, int D, class F> void with_each(const pbfd_plan* p, const void* rows, Arena<V> arena, F&& make) {
-  Numbers<V> own = numbers_of(p, rows, 0, Plan<V, D>::real_numbers(sizes(p)), arena);
-  const Plan<V, D> plan = plan_of<V, D>(p, own.lanes);
-  make(plan, own, plan.contact.grip, arena);
 }
 
 // The same; worlds that differ by their μ, if at all, share a plan: there is less to be read. Others are seen in space.
@@ -152,29 +134,6 @@ void record_by(const pbfd_plan* p, const pbfd_roster* r, const pbfd_record* a, v
   (p->bytes == 8 ? record_of<Scheme, double> : record_of<Scheme, float>)(p, r, a, room);
 }
 
-// Steps of a scheme followed back.
-template <int D, template <class, class, int> class Scheme> void back_of(const pbfd_plan* p, const pbfd_descent* d, void* room) {
-  using L = Lanes<double, register_bytes / 8>;
-  using Followed = Adjoint<L, D, Scheme>;
-  const Descent<double> of = {
-      d->worlds, d->steps, d->rows, d->halvings, d->held != 0, d->alike != 0, d->refined != 0, d->dropped != 0,
-      static_cast<const double*>(d->dt), d->given, d->found, static_cast<const double*>(d->control), timetable<double>(p, d),
-      d->detour, d->halved, d->eased, static_cast<const double*>(d->ends), d->constant, d->cotangent, d->seen,
-      static_cast<double*>(d->by_control), static_cast<double*>(d->by_number), static_cast<double*>(d->by_dt), d->singular};
-  const Rules rules = {0, HUGE_VAL, d->share, d->jump, d->halvings, 0, 0, 0, 0};
-  with_each<L, D>(p, d->own, {static_cast<L*>(room)}, [&](const Plan<L, D>& plan, Numbers<L>& own, const L*, Arena<L>& arena) {
-    Arena<Traced<L>> written{reinterpret_cast<Traced<L>*>(arena.next + Followed::room(plan))};
-    std::memset(static_cast<void*>(written.next), 0, Followed::written_room(plan) * sizeof(Traced<L>));  // nothing there is a node
-    Followed(p, plan, own, arena, written).run(of, rules, d->first, d->last);
-  });
-}
-
-template <template <class, class, int> class Scheme> long room_back(Sizes s) {
-  using L = Lanes<double, register_bytes / 8>;
-  using Followed = Adjoint<L, 3, Scheme>;
-  return (Plan<L, 3>::real_numbers(s) + Followed::room(s)) * long(sizeof(L)) + Followed::written_room(s) * long(sizeof(Traced<L>));
-}
-
 // Room for lanes V, in V; a plane needs less.
 template <class V> int room_of(Sizes s) {
   using First = EnergyMomentum<V, V, 3>;
@@ -201,8 +160,7 @@ long pbfd_room(const pbfd_plan* p) {
   using Wide = Lanes<double, register_bytes / 8>;
   using Narrow = Lanes<float, register_bytes / 4>;
   const int wide = room_of<Wide>(sizes(p)), narrow = room_of<Narrow>(sizes(p));
-  return std::max({long(register_bytes) * std::max(wide, narrow), room_back<EnergyMomentum>(sizes(p)),
-                   room_back<ImplicitEuler>(sizes(p)), room_back<Bdf2>(sizes(p))});
+  return std::max(long(register_bytes) * std::max(wide, narrow), room_back(sizes(p)));
 }
 
 void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<EnergyMomentum>>(p, s, room); }
@@ -210,16 +168,6 @@ void pbfd_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
 void pbfd_implicit_euler(const pbfd_plan* p, const pbfd_steps* s, void* room) { make_by<Going<ImplicitEuler>>(p, s, room); }
 
 void pbfd_bdf2(const pbfd_plan* p, const pbfd_steps* s, void* room) { in_space<Going<Bdf2>>(p, s, room); }
-
-void pbfd_energy_momentum_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
-  p->dimension == 3 ? back_of<3, EnergyMomentum>(p, d, room) : back_of<2, EnergyMomentum>(p, d, room);
-}
-
-void pbfd_implicit_euler_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
-  p->dimension == 3 ? back_of<3, ImplicitEuler>(p, d, room) : back_of<2, ImplicitEuler>(p, d, room);
-}
-
-void pbfd_bdf2_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { back_of<3, Bdf2>(p, d, room); }
 
 void pbfd_start_energy_momentum(const pbfd_plan* p, const pbfd_steps* s, void* room) {
   make_by<Starting<EnergyMomentum>>(p, s, room);
