@@ -21,7 +21,8 @@ from pbfd_torch.integrators.integrator import S
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.descending import Descending, Numbers, Walked
-from pbfd_torch.tensors.plain import carries, wrapped
+from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.plain import carries, changes, primal, wrapped
 from pbfd_torch.tensors.shapes import spread
 from pbfd_torch.tensors.structures import mapped_tensors, tensors_of
 from pbfd_torch.tensors.worlds import replaced
@@ -44,12 +45,12 @@ class Walker(Generic[S]):
 
     def __init__(self, linked: Linked[S], maker: Descending[S], back: Descending[S], numbers: Numbers | None) -> None:
         self.gradients, self.maker, self.back = linked.gradients, maker, back
-        self._numbers = () if numbers is None else (numbers.shared, numbers.own, numbers.step_size)
+        self.known = () if numbers is None else (numbers.shared, numbers.own, numbers.step_size)
 
     @property
     def numbered(self) -> bool:
         """Whether the steps depend on the engine's numbers as on the state."""
-        return bool(self._numbers)
+        return bool(self.known)
 
     @classmethod
     def of(cls, linked: Linked[S], state: S, controls: Tensor | None) -> Walker[S] | None:
@@ -57,11 +58,11 @@ class Walker(Generic[S]):
         # the engine adapts terms itself
         active = [x for x in tensors_of(replaced(linked.parts, adapted=())) if carries(x) or wrapped(x)]
         given = [*tensors_of([state, controls]), *active]
-        if linked.gradients.blur is not None or any(map(wrapped, given)) or not torch.is_grad_enabled():
+        if linked.gradients.blur is not None or any(map(wrapped, given)):
             return None
-        if any(carries(x) and not x.requires_grad for x in given):
-            return None  # forward derivatives
-        plain = linked.plain([linked.leaves[k].detach() for k in linked.active])
+        if any(map(changes, given)) and any(x.requires_grad for x in given):
+            return None  # both ways at once
+        plain = linked.plain([primal(linked.leaves[k]) for k in linked.active])
         maker = linked.maker(plain, state)
         if not isinstance(maker, Descending) or not maker.descends:
             return None
@@ -69,10 +70,11 @@ class Walker(Generic[S]):
             wide = precise(plain)
             back = maker if wide is plain else linked.engine(wide)
             return cls(linked, maker, back, None) if isinstance(back, Descending) else None
-        known = maker.precise(precise(linked.stepper), precise(plain))
-        if known is None or not _reach(known[1], active):
+        wide = precise(plain)
+        if not _known(linked, maker, wide):
             return None
-        return cls(linked, maker, *known)
+        known = maker.precise(precise(linked.stepper), wide)
+        return None if known is None else cls(linked, maker, *known)
 
     def walk(self, state: S, controls: Tensor | None, steps: int, kept: bool = True) -> tuple[S, Walk]:
         """The states after each of so many steps, `[steps, *batch, ...]`, and how they were made; kept: the node keeps that, and
@@ -80,7 +82,7 @@ class Walker(Generic[S]):
         given = self.maker.fields(state)
         controls = None if controls is None else spread(controls, state.time.shape)
         node = _Node(self, state, controls, steps, kept)
-        values = [*given.values(), *([] if controls is None else [controls]), *self._numbers]
+        values = [*given.values(), *([] if controls is None else [controls]), *self.known]
         found = dict(zip(given, _Walk.apply(node, *values), strict=True))  # type: ignore[no-untyped-call]
         return self.maker.restored(state, found, node.other), node.walk
 
@@ -97,12 +99,19 @@ def stepped(linked: Linked[S], state: S, control: Tensor | None) -> tuple[S, Sol
     return cast(S, end), cast(Solution, solution)
 
 
-def _reach(numbers: Numbers, active: Sequence[Tensor]) -> bool:
-    """Whether an engine's numbers know of all of these."""
-    outputs = [x for x in (numbers.shared, numbers.own, numbers.step_size) if x.requires_grad]
+def _known(linked: Linked[Any], maker: Descending[Any], wide: EagerStepper[Any]) -> bool:
+    """Whether an engine's numbers know of all in a stepper that carries derivatives; wide: without any, in double precision."""
+    values = [primal(linked.leaves[k]).requires_grad_() for k in linked.active]
+    with torch.enable_grad():
+        known = maker.precise(precise(linked.with_values(values)), wide)
+    if known is None:
+        return False
+    outputs = [x for x in vars(known[1]).values() if x.requires_grad]
+    # the engine adapts terms itself
+    count = sum(map(carries, tensors_of(replaced(linked.parts, adapted=()))))
     if not outputs:
         return False
-    found = torch.autograd.grad([x.sum() for x in outputs], active, allow_unused=True, retain_graph=True)
+    found = torch.autograd.grad([x.sum() for x in outputs], values[:count], allow_unused=True)
     return all(x is not None for x in found)
 
 
@@ -117,8 +126,8 @@ class _Node:
     def __init__(self, walker: Walker[Any], state: Any, controls: Tensor | None, steps: int, kept: bool) -> None:
         self._walker, self._steps, self._kept = walker, steps, kept
         self.numbered = walker.numbered
-        self._state: Any = mapped_tensors(state, torch.detach)
-        self._controls = None if controls is None else controls.detach()
+        self._state: Any = mapped_tensors(state, primal)
+        self._controls = None if controls is None else primal(controls)
         self._path: Any = None
 
     def run(self) -> tuple[Tensor, ...]:
@@ -135,15 +144,10 @@ class _Node:
     def pulled(self, seen: Sequence[Tensor | None], numbers: bool) -> list[Tensor | None]:
         """Derivatives by the start's fields, the controls, and the engine's numbers if asked for, of those by the fields after each
         step."""
-        path = self._made().path if self._path is None else self._path
-        walker, walk, policy = self._walker, self.walk, self._walker.gradients.doubtful
-        self._complain(int(Doubt.UNSOLVED))
-        unsolved = (walk.doubts & int(Doubt.UNSOLVED)) > 0
-        constant = unsolved if policy is Doubtful.ZERO and bool(unsolved.any()) else None
+        path, constant, dropped = self._to_follow()
         named = dict(zip(path.found, seen, strict=True))
-        back = walker.back.back(path, named, constant=constant, dropped=policy is Doubtful.ZERO, numbers=numbers)
-        walk.doubts |= int(Doubt.SINGULAR) * back.singular.int()
-        self._complain(int(Doubt.SINGULAR))
+        back = self._walker.back.back(path, named, constant=constant, dropped=dropped, numbers=numbers)
+        self._note(back.singular)
         found: list[Tensor | None] = [x[0] for x in back.start.values()]
         if self._controls is not None:
             found.append(back.control[0])
@@ -151,6 +155,36 @@ class _Node:
             assert back.numbers is not None
             found += [back.numbers.shared, back.numbers.own, back.numbers.step_size]
         return found
+
+    def pushed(self, changed: Sequence[Tensor | None]) -> list[Tensor]:
+        """How the fields after each step change with the start's fields, the controls and the engine's numbers."""
+        path, constant, dropped = self._to_follow()
+        given, like = list(path.given), self._like(path)
+        whole = [torch.zeros_like(x) if y is None else y.to(x.dtype) for x, y in zip(like, changed, strict=True)]
+        start, rest = dict(zip(given, whole, strict=False)), whole[len(given) :]
+        steps, *batch = path.found["q"].shape[:-1]
+        held = rest.pop(0) if self._controls is not None else path.control.new_zeros(steps, *batch, path.control.shape[-1])
+        numbers = Numbers(*rest) if self.numbered else None
+        found, singular = self._walker.back.ahead(path, start, held.double(), numbers, constant, dropped)
+        self._note(singular)
+        return list(found.values())
+
+    def _like(self, path: Any) -> list[Tensor]:
+        """What `pushed` is given, in double precision."""
+        fields = [x.double() for x in path.given.values()]
+        held = [] if self._controls is None else [self._controls.double()]
+        return [*fields, *held, *map(primal, self._walker.known)]
+
+    def _to_follow(self) -> tuple[Any, Tensor | None, bool]:
+        """The path, which of its steps count as constants, and whether those with a singular J do."""
+        self._complain(int(Doubt.UNSOLVED))
+        unsolved, zero = (self.walk.doubts & int(Doubt.UNSOLVED)) > 0, self._walker.gradients.doubtful is Doubtful.ZERO
+        path = self._made().path if self._path is None else self._path
+        return path, unsolved if zero and bool(unsolved.any()) else None, zero
+
+    def _note(self, singular: Tensor) -> None:
+        self.walk.doubts |= int(Doubt.SINGULAR) * singular.int()
+        self._complain(int(Doubt.SINGULAR))
 
     def _complain(self, doubt: int) -> None:
         """As for single steps, of the last step that is in doubt first."""
@@ -180,3 +214,7 @@ class _Walk(torch.autograd.Function):
         found = ctx.node.pulled(seen, any(needed[-3:]) and ctx.node.numbered)
         found += [None] * (len(needed) - len(found))
         return None, *(None if x is None or not need else x.to(t) for x, need, t in zip(found, needed, ctx.dtypes, strict=True))
+
+    @staticmethod
+    def jvp(ctx: Any, _: None, *changed: Tensor | None) -> tuple[Tensor, ...]:
+        return tuple(x.to(ctx.dtypes[0]) for x in ctx.node.pushed(changed))

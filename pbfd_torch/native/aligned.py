@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pbfd_torch.tensors.plain import carries
 from pbfd_torch.tensors.worlds import replaced
 from pbfd_torch.tree.articulation import Articulation, homogeneous
 
@@ -22,7 +23,7 @@ def aligned(a: Articulation) -> Articulation:
         if size == (1, 1):
             rotation, axis = frame[..., :3, :3], a.joint_axis[..., j, None, :]
             there = (rotation[..., 2, :] - axis).abs().amax(-1) <= 4.0 * torch.finfo(a.dtype).eps
-            as_parent = there[..., None, None] & (not (rotation.requires_grad or axis.requires_grad))  # which cannot tilt
+            as_parent = there[..., None, None] & (not (carries(rotation) or carries(axis)))  # which cannot tilt
             turn = torch.where(as_parent, rotation.mT, _turning(axis))
             frame = homogeneous(torch.where(as_parent, eye, rotation @ turn), frame[..., :3, 3])
         turns.append(turn)

@@ -216,6 +216,15 @@ class Core:
     ) -> None:
         """Follows a path back, of a core of double precision. seen: derivatives by its fields after each step. constant: `[steps,
         *batch]`, whose ends count as constants; dropped: so do those with a singular J."""
+        self._follow("back", path, back, seen, constant, dropped)
+
+    def ahead(self, path: Path, start: Back, found: Mapping[str, Tensor], constant: Tensor | None, dropped: bool) -> None:
+        """The same ahead: from changes of what the path was made of to those of its fields after each step, `found`."""
+        self._follow("ahead", path, start, found, constant, dropped)
+
+    def _follow(
+        self, way: str, path: Path, back: Back, seen: Mapping[str, Tensor | None], constant: Tensor | None, dropped: bool
+    ) -> None:
         asked = back.call(path, seen, constant, dropped)
         terms = self._terms
         alike = terms.dt.ndim == 0
@@ -224,7 +233,7 @@ class Core:
         asked.share, asked.jump = terms.share, terms.jump
         own = whole(self.plan.own, (*path.given["q"].shape[:-1], self.plan.own.shape[-1]))
         asked.own = own.data_ptr()
-        self._calls.share(f"{self._scheme.function}_back", asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
+        self._calls.share(f"{self._scheme.function}_{way}", asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
 
     def start(self, q: Tensor, v: Tensor, control: Tensor) -> tuple[Journey, Tensor]:
         """The fields of the states at t = 0 of all worlds at q `[*batch, nq]` with v `[*batch, nv]` under a control `[1, *batch,

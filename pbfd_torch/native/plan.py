@@ -22,6 +22,7 @@ from pbfd_torch.native.plan_torsion import torsions
 from pbfd_torch.native.plane import Plane as MotionPlane
 from pbfd_torch.native.plane import plane_of
 from pbfd_torch.stepping.eager import EagerStepper
+from pbfd_torch.tensors.plain import carries
 from pbfd_torch.tensors.structures import tensors_of
 from pbfd_torch.tensors.worlds import Worlds, replaced
 from pbfd_torch.terms.actuators import Actuators
@@ -99,7 +100,7 @@ def planned_with_derivatives(stepper: EagerStepper[Any]) -> Plan | None:
     hidden = [plan.sample, *parts.candidates.laws.constants, *tensors_of(plan.carriers.each)]
     if _free(parts.a):  # they move along the world's axes, whatever their frames
         hidden.append(stepper.articulation.joint_frame)
-    return None if any(x.requires_grad for x in hidden) else plan
+    return None if any(map(carries, hidden)) else plan
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,7 @@ from pbfd_torch.stepping.descending import Numbers, Pulled, Walked
 from pbfd_torch.stepping.eager import EagerStepper
 from pbfd_torch.stepping.stepper import SHORTEST_STEP, Solver
 from pbfd_torch.stepping.way import Way
+from pbfd_torch.tensors.plain import primal
 from pbfd_torch.tensors.shapes import spread
 from pbfd_torch.tensors.worlds import Worlds, replaced
 
@@ -162,7 +163,7 @@ class NativeStepper(Generic[S]):
         if plan is None:
             return None
         numbers = Numbers(plan.real, plan.own, stepper.step_size)
-        return NativeStepper(plain, self.threads, replaced(plan, real=plan.real.detach(), own=plan.own.detach())), numbers
+        return NativeStepper(plain, self.threads, replaced(plan, real=primal(plan.real), own=primal(plan.own))), numbers
 
     def walk(self, state: S, controls: Tensor | None, steps: int) -> Walked:
         """See `Descending`."""
@@ -204,6 +205,29 @@ class NativeStepper(Generic[S]):
             own = _summed(back.numbers[..., which], plan.own)
             found = Numbers(shared, own, _summed(back.step_size, self.step_size))
         return Pulled(back.by, back.control, found, back.singular > 0)
+
+    def ahead(
+        self,
+        path: Path,
+        start: Mapping[str, Tensor],
+        control: Tensor,
+        numbers: Numbers | None,
+        constant: Tensor | None,
+        dropped: bool,
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Descending`."""
+        plan, path = self._core.plan, path.precise()
+        back = Back(path, {name: x[None] for name, x in start.items()}, len(plan.real) if numbers else 0)
+        back.control[0] = control
+        if numbers is not None:
+            assert back.numbers is not None
+            assert back.step_size is not None
+            back.numbers[...] = numbers.shared
+            back.numbers[..., plan.which.long()] = numbers.own
+            back.step_size[...] = numbers.step_size
+        found = {name: torch.zeros_like(x) for name, x in path.found.items()}
+        self._core.ahead(path, back, found, constant, dropped)
+        return found, back.singular > 0
 
     def _went(self, state: S, controls: Tensor | None, steps: tuple[int, ...], led: bool = False) -> Journey:
         """The states after steps, and how these were solved; led: and how each was made."""

@@ -95,3 +95,16 @@ class Descending(Protocol[S]):
         besides. constant: `[steps, *batch]` bool, steps whose end counts as one; dropped: so does that of those with a singular
         J. numbers: whether derivatives by these are asked for."""
         ...
+
+    def ahead(
+        self,
+        path: Any,
+        start: Mapping[str, Tensor],
+        control: Tensor,
+        numbers: Numbers | None,
+        constant: Tensor | None,
+        dropped: bool,
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """The same ahead: how the fields of the states after each step change `[steps, *batch, ...]`, and which steps have a singular
+        J `[steps, *batch]` bool, where the start's fields, the controls `[steps, *batch, nu]` and the numbers change like this."""
+        ...

@@ -19,8 +19,18 @@ def plain(value: Tensor) -> Tensor:
     return value.detach()
 
 
+def primal(value: Tensor) -> Tensor:
+    """Its values without derivatives, backward or forward ones."""
+    return forward_ad.unpack_dual(value).primal.detach() if value.is_floating_point() else value.detach()
+
+
+def changes(value: Tensor) -> bool:
+    """Whether it has a forward derivative."""
+    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
+
+
 def carries(value: Tensor) -> bool:
     """Whether a tensor carries derivatives, backward or forward ones."""
     if torch.is_grad_enabled() and value.requires_grad:
         return True
-    return value.is_floating_point() and forward_ad.unpack_dual(value).tangent is not None
+    return changes(value)

@@ -1,4 +1,4 @@
-// Steps followed back: a translation unit of its own, so that both are compiled side by side.
+// Steps followed back, and ahead: a translation unit of its own, so that both are compiled side by side.
 #include <algorithm>
 #include <cstring>
 
@@ -6,16 +6,18 @@
 #include "bdf2.h"
 #include "energy_momentum.h"
 #include "implicit_euler.h"
+#include "tangent.h"
 #include "target.h"
 
 using namespace pbfd;
 
 namespace {
 
-// Steps of a scheme followed back.
-template <int D, template <class, class, int> class Scheme> void back_of(const pbfd_plan* p, const pbfd_descent* d, void* room) {
+// Steps of a scheme followed back, or ahead.
+template <template <class, int, template <class, class, int> class> class Way, int D, template <class, class, int> class Scheme>
+void follow(const pbfd_plan* p, const pbfd_descent* d, void* room) {
   using L = Lanes<double, register_bytes / 8>;
-  using Followed = Adjoint<L, D, Scheme>;
+  using Followed = Way<L, D, Scheme>;
   const Descent<double> of = {
       d->worlds, d->steps, d->rows, d->halvings, d->held != 0, d->alike != 0, d->refined != 0, d->dropped != 0,
       static_cast<const double*>(d->dt), d->given, d->found, static_cast<const double*>(d->control), timetable<double>(p, d),
@@ -29,9 +31,14 @@ template <int D, template <class, class, int> class Scheme> void back_of(const p
   });
 }
 
+template <template <class, int, template <class, class, int> class> class Way, template <class, class, int> class Scheme>
+void go(const pbfd_plan* p, const pbfd_descent* d, void* room) {
+  p->dimension == 3 ? follow<Way, 3, Scheme>(p, d, room) : follow<Way, 2, Scheme>(p, d, room);
+}
+
 template <template <class, class, int> class Scheme> long room_for_scheme(Sizes s) {
   using L = Lanes<double, register_bytes / 8>;
-  using Followed = Adjoint<L, 3, Scheme>;
+  using Followed = Retrace<L, 3, Scheme>;
   return (Plan<L, 3>::real_numbers(s) + Followed::room(s)) * long(sizeof(L)) + Followed::written_room(s) * long(sizeof(Traced<L>));
 }
 
@@ -41,12 +48,14 @@ long pbfd::room_back(Sizes s) {
   return std::max({room_for_scheme<EnergyMomentum>(s), room_for_scheme<ImplicitEuler>(s), room_for_scheme<Bdf2>(s)});
 }
 
-void pbfd_energy_momentum_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
-  p->dimension == 3 ? back_of<3, EnergyMomentum>(p, d, room) : back_of<2, EnergyMomentum>(p, d, room);
-}
+void pbfd_energy_momentum_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { go<Adjoint, EnergyMomentum>(p, d, room); }
 
-void pbfd_implicit_euler_back(const pbfd_plan* p, const pbfd_descent* d, void* room) {
-  p->dimension == 3 ? back_of<3, ImplicitEuler>(p, d, room) : back_of<2, ImplicitEuler>(p, d, room);
-}
+void pbfd_energy_momentum_ahead(const pbfd_plan* p, const pbfd_descent* d, void* room) { go<Tangent, EnergyMomentum>(p, d, room); }
 
-void pbfd_bdf2_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { back_of<3, Bdf2>(p, d, room); }
+void pbfd_implicit_euler_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { go<Adjoint, ImplicitEuler>(p, d, room); }
+
+void pbfd_implicit_euler_ahead(const pbfd_plan* p, const pbfd_descent* d, void* room) { go<Tangent, ImplicitEuler>(p, d, room); }
+
+void pbfd_bdf2_back(const pbfd_plan* p, const pbfd_descent* d, void* room) { follow<Adjoint, 3, Bdf2>(p, d, room); }
+
+void pbfd_bdf2_ahead(const pbfd_plan* p, const pbfd_descent* d, void* room) { follow<Tangent, 3, Bdf2>(p, d, room); }

@@ -103,7 +103,7 @@ struct pbfd_descent {
   const void* ends;
   const int* constant;
   void* cotangent[10];
-  const void* seen[10];
+  void* seen[10];
   void *by_control, *by_number, *by_dt;
   int* singular;
 };
@@ -111,6 +111,11 @@ struct pbfd_descent {
 PBFD_FUNCTION void pbfd_energy_momentum_back(const pbfd_plan*, const pbfd_descent*, void* room);
 PBFD_FUNCTION void pbfd_implicit_euler_back(const pbfd_plan*, const pbfd_descent*, void* room);
 PBFD_FUNCTION void pbfd_bdf2_back(const pbfd_plan*, const pbfd_descent*, void* room);
+// The same ahead, of one row: cotangent, by_control, by_number and by_dt are changes of what the steps are made of, or null (the last
+// two), and `seen` becomes the changes of the states after each.
+PBFD_FUNCTION void pbfd_energy_momentum_ahead(const pbfd_plan*, const pbfd_descent*, void* room);
+PBFD_FUNCTION void pbfd_implicit_euler_ahead(const pbfd_plan*, const pbfd_descent*, void* room);
+PBFD_FUNCTION void pbfd_bdf2_ahead(const pbfd_plan*, const pbfd_descent*, void* room);
 
 // States at t = 0 of worlds that are given by q, v and one control, found as after one step. What is reported is the trial step.
 PBFD_FUNCTION void pbfd_start_energy_momentum(const pbfd_plan*, const pbfd_steps*, void* room);
