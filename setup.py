@@ -1,7 +1,8 @@
 """Builds the native core with the C++ compiler that is there. Everything else of the installation is in pyproject.toml.
 
-The core, pbfd_torch/native/src, two translation units, is compiled once per kind of processor into plain shared objects, which Python loads by ctypes:
-they know nothing of Python and torch. Where that fails the installation goes on without them, and a file keeps the reason.
+The core, pbfd_torch/native/src, is two translation units, compiled once per kind of processor into plain shared objects, which
+Python loads by ctypes: they know nothing of Python and torch. Where that fails the installation goes on without them, and a file
+keeps the reason.
 """
 
 from __future__ import annotations

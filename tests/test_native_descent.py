@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from pbfd_torch import EventSimulator, Gradients, RungeKutta, Simulator, parameters, with_parameters
 from pbfd_torch.gradients.implicit import Blur
 from pbfd_torch.gradients.linked import Linked
+from pbfd_torch.gradients.trajectory import Trajectory
 from pbfd_torch.gradients.walks import Walk, Walker
 from pbfd_torch.integrators.bdf2 import Bdf2
 from pbfd_torch.integrators.energy_momentum import EnergyMomentum
@@ -172,6 +174,35 @@ def test_a_motion_in_one_call() -> None:
     tilt = [torch.randn(path.q.shape, dtype=v.dtype, generator=random) for _ in range(2)]
     ((torch.stack(q) * tilt[0]).sum() + (torch.stack(speed) * tilt[1]).sum()).backward()
     assert off([v.grad, held.grad], list(found)) <= 1e-8  # what 24 steps through contact make of rounding
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_forward_derivatives(own: bool) -> None:
+    """By the start, the controls and masses, along a random direction: as backward ones say, in one call for all steps."""
+    simulator, state, control = under_way("hopper")
+    controls = control + torch.randn(12, *control.shape, dtype=control.dtype, generator=generator(5))
+    name, random = "articulation.pseudo_inertia", generator(6)
+    inertia = parameters(simulator.scene)[name]
+    inertia = inertia.expand(WORLDS, *inertia.shape).clone() if own else inertia
+    values = [state.v, controls, inertia]
+    along = [torch.randn(x.shape, dtype=x.dtype, generator=random) * x.abs().clamp_min(1e-3) for x in values]
+    along[2] = along[2] + along[2].mT
+
+    def motion(v: Tensor, held: Tensor, masses: Tensor) -> Trajectory[Any]:
+        made = simulator.with_scene(with_parameters(simulator.scene, {name: masses}))
+        return made.trajectory(replaced(state, v=v), held)
+
+    back = [x.clone().requires_grad_() for x in values]
+    path = motion(*back)
+    tilt = torch.randn(path.q.shape, dtype=path.q.dtype, generator=random)
+    (path.q * tilt).sum().backward()
+    right = sum(float((x.grad * y).sum()) for x, y in zip(back, along, strict=True) if x.grad is not None)
+    with forward_ad.dual_level():
+        path = motion(*(forward_ad.make_dual(x, y) for x, y in zip(values, along, strict=True)))
+        assert all(isinstance(x, Walk) for x in path._made)
+        found = forward_ad.unpack_dual(path.q).tangent
+    assert found is not None
+    assert float((found * tilt).sum()) == pytest.approx(right, rel=1e-9)
 
 
 @pytest.mark.parametrize("batch", [(), (2, 3)])

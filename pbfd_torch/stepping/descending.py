@@ -105,6 +105,7 @@ class Descending(Protocol[S]):
         constant: Tensor | None,
         dropped: bool,
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """The same ahead: how the fields of the states after each step change `[steps, *batch, ...]`, and which steps have a singular
-        J `[steps, *batch]` bool, where the start's fields, the controls `[steps, *batch, nu]` and the numbers change like this."""
+        """The same ahead: how the fields of the states after each step change `[steps, *batch, ...]`, and which steps have a
+        singular J `[steps, *batch]` bool, where the start's fields, the controls `[steps, *batch, nu]` and the numbers change like
+        this."""
         ...
