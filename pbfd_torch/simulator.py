@@ -282,14 +282,18 @@ class AdaptiveSimulator(Simulator[S]):
 
 
 class EventSimulator(Simulator[S]):
-    """A `Simulator` whose steps are cut where something strikes on the way of an explicit one (`schedules.events`): up to there,
-    and from there on. So impacts happen when they should, and derivatives go through them.
+    """A `Simulator` whose steps are cut at the instant at which something strikes on the way of an explicit one, and at that at
+    which a contact stops sliding (`schedules.events`, `schedules.stops`): up to there, and from there on. So impacts happen, and
+    slides end, when they should, and derivatives go through them.
 
     `integrator`: one that makes explicit steps, `RungeKutta`; None: that one. The rest: as in `Simulator`. Raises `InputError`
     for others. A step is cut at most five times, and no closer to its start than 1e-6 of it: what strikes again so soon, and what
-    strikes while something else presses, does so within a step as in a `Simulator`. The solution's `strike` is the share of the
-    step after which something first strikes, its `steps` the parts of it. Each part is a call of its own, and a rollout is not
-    one call of the core. Derivatives by autograd and forward_ad, not by torch.func."""
+    strikes while something else presses, does so within a step as in a `Simulator`. Sliding stops where 2 slip speeds of the
+    friction law (`CoulombFriction`, `StaticFriction`) are left, in contacts that have slid at more than 4 and press all along;
+    other laws, and `BodyContact` with obstacles that move, stop within a step as in a `Simulator`. The
+    solution's `strike` is the share of the step after which something first strikes, its `steps` the parts of it, whatever it was
+    cut for. Each part is a call of its own, a rollout is not one call of the core, and steps in which something slides cost some
+    milliseconds more. Derivatives by autograd and forward_ad, not by torch.func."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
-"""Steps of one length that are cut where something strikes: each is made up to there, and from there on.
+"""Steps of one length that are cut where something strikes or stops sliding: each is made up to there, and from there on.
 
 A step that ends long after an impact within it knows neither when that was nor what a change of the start does to it: its
 derivatives, though exact, are those of a bounce at the step's end (docs/GRADIENTS.md). Cut at the instant τ at which something
 first touches on the way of an explicit step (`RungeKutta`), its end depends on the start through τ as well: dτ = −dg/ġ, g how
-hard it touches a little later.
+hard it touches a little later. When sliding stops: `stops`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pbfd_torch.integrators.integrator import S
 from pbfd_torch.integrators.runge_kutta import standing
 from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
 from pbfd_torch.schedules.composed import Composed
+from pbfd_torch.schedules.stops import Reached, at_stop, stopping
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.stepper import Stepper
@@ -35,12 +36,12 @@ LATER = (1e-6, 1e-5, 1e-4, 1e-3)  # of the step, after the instant: when it is f
 
 
 def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor | None, cuts: int = CUTS) -> tuple[S, Solution]:
-    """The step, in worlds in which something strikes up to there and on from there, with so many cuts at most. It carries the
-    derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that was tried has
-    cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where a strike is left within it. Raises
-    `GradientError` in torch.func."""
+    """The step, in worlds in which something strikes or stops sliding up to there and on from there, with so many cuts at most. It
+    carries the derivatives that the steps of `make` carry. The solution has the worst status of a world's parts and what all that
+    was tried has cost; its `strike` is when something first strikes, and its `steps` are the parts: one, where all that happens is
+    left within it. Raises `GradientError` in torch.func."""
     if any(map(wrapped, tensors_of(state))):
-        raise GradientError("torch.func cannot look into steps that are cut where something strikes: use autograd or forward_ad")
+        raise GradientError("torch.func cannot look into steps that are cut on their way: use autograd or forward_ad")
     if state.time.ndim == 0:  # a single world without batch: a batch of one
         alone = mapped(lambda x: x[None], state)
         made = made_with_events(make, stepper, alone, None if control is None else control[None], cuts)
@@ -49,46 +50,55 @@ def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor 
     solution = replaced(solution, steps=torch.ones_like(solution.status))
     if cuts == 0 or solution.strike is None:
         return end, solution
-    size = stepper.step_size.detach().expand(solution.strike.shape)
-    apart = (solution.strike > BRINK) & ((1 - solution.strike) * size >= REST * stepper.dt)
-    index = ((solution.strike < 1) & apart).reshape(-1).nonzero().squeeze(-1)
-    if len(index) == 0:
-        return end, solution
-    worlds, everywhere = Worlds(tuple(solution.strike.shape), index), torch.ones_like(index, dtype=torch.bool)
-    part, before, held = stepper.take(worlds), state.take(worlds), None if control is None else worlds.pick(control, 1)
-    whole = part.step_size.expand(index.shape)
-    at, touch, found = _at_strike(make, part, before, held, worlds.rows(solution.strike) * whole.detach(), whole)
-    rest = part.sized(whole - at)
-    after, last = made_with_events(
-        make, rest, part.integrator.resized(part.scene.articulation, touch, at, rest.step_size), held, cuts - 1
-    )
-    after = part.integrator.resized(part.scene.articulation, after, rest.step_size, whole)
-    after = replaced(after, hazards=touch.hazards | after.hazards)
-    return put(end, after, worlds, everywhere), _joined(solution, worlds, (found, last))
+    strike, stopped = solution.strike, stopping(stepper, state, end, control)
+    size = stepper.step_size.detach().expand(strike.shape)
+    struck = (strike < 1) & (strike > BRINK) & ((1 - strike) * size >= REST * stepper.dt)
+    for cut, when in ((struck, strike), (stopped, None)):
+        index = None if cut is None else cut.reshape(-1).nonzero().squeeze(-1)
+        if index is None or len(index) == 0:
+            continue
+        worlds, everywhere = Worlds(tuple(size.shape), index), torch.ones_like(index, dtype=torch.bool)
+        held = None if control is None else worlds.pick(control, 1)
+        ends = state.take(worlds), end.take(worlds)
+        after, parts = _cut(make, stepper.take(worlds), ends, held, None if when is None else worlds.rows(when), cuts)
+        end, solution = put(end, after, worlds, everywhere), _joined(solution, worlds, parts)
+    return end, solution
 
 
-def _at_strike(
-    make: Make, stepper: Stepper[S], state: S, control: Tensor | None, at: Tensor, whole: Tensor
-) -> tuple[Tensor, S, Solution]:
-    """When something strikes after a state [s] `[n]`, about at `at`, the state there, and how it was made; whole: the step [s]
-    `[n]` that the state's history is for."""
-    a, integrator = stepper.scene.articulation, stepper.integrator
+def _cut(
+    make: Make, stepper: Stepper[S], ends: tuple[S, S], control: Tensor | None, strike: Tensor | None, cuts: int
+) -> tuple[S, tuple[Solution, Solution]]:
+    """A step in two parts, up to where something strikes, after about a share `strike` `[n]` of it, or None: where something stops
+    sliding: the state after it, and how both were made. ends: the states before the step and after it as a whole."""
+    a, integrator, whole = stepper.scene.articulation, stepper.integrator, stepper.step_size.expand(ends[0].time.shape)
 
-    def reached(time: Tensor) -> tuple[S, Solution]:
-        return make(stepper.sized(time), integrator.resized(a, state, whole, time), control)
+    def reached(start: S, time: Tensor) -> tuple[S, Solution]:
+        return make(stepper.sized(time), integrator.resized(a, start, whole, time), control)
 
-    end, solution = reached(at)
+    if strike is None:
+        at, there, first = at_stop(reached, stepper, ends, control, whole.detach() - REST * stepper.dt)
+    else:
+        at, there, first = _at_strike(reached, stepper, ends[0], control, strike * whole.detach())
+    rest = stepper.sized(whole - at)
+    after, last = made_with_events(make, rest, integrator.resized(a, there, at, rest.step_size), control, cuts - 1)
+    after = integrator.resized(a, after, rest.step_size, whole)
+    return replaced(after, hazards=there.hazards | after.hazards), (first, last)
+
+
+def _at_strike(reached: Reached, stepper: Stepper[S], state: S, control: Tensor | None, at: Tensor) -> tuple[Tensor, S, Solution]:
+    """When something strikes after a state [s] `[n]`, about at `at`, the state there, and how it was made."""
+    end, solution = reached(state, at)
     spent = solution.evaluations
     for _ in range(CUTS):  # the way there is known better from nearby
         strike = solution.strike
         if strike is None or not bool((early := (strike < 1) & (strike > BRINK)).any()):
             break
         at = torch.where(early, strike * at, at)
-        end, solution = reached(at)
+        end, solution = reached(state, at)
         spent = spent + torch.where(early, solution.evaluations, 0)
     if carries(end.q):
         at = at + _shift(stepper.sized(at), end, control, at)
-        end, solution = reached(at)
+        end, solution = reached(state, at)
     return at, end, replaced(solution, evaluations=spent, steps=torch.ones_like(solution.status))
 
 
@@ -143,7 +153,7 @@ def _joined(whole: Solution, worlds: Worlds, parts: tuple[Solution, Solution]) -
 
 
 class EventStepper(Composed[S]):
-    """A `Stepper` whose steps are cut where something strikes. `fixed`: makes the parts, and the steps that are not cut."""
+    """A `Stepper` whose steps are cut where something strikes or stops sliding. `fixed`: makes the parts, and all other steps."""
 
     def made(self, state: S, control: Tensor | None) -> tuple[S, Solution, Way]:
         """See `Stepper`. Its way leads nowhere back: derivatives go through its parts."""
