@@ -14,11 +14,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pbfd_torch.checked import Array
 from pbfd_torch.errors import InputError
 from pbfd_torch.looks.appearance import Appearance, packed, unpacked
 from pbfd_torch.records import archive
 from pbfd_torch.records.consistency import require_drawable, require_fitting, require_plausible
+from pbfd_torch.records.dense_output import DenseOutput, dense_output
 from pbfd_torch.solvers.objective import is_solved
+from pbfd_torch.tree.articulation import Articulation
 
 FORMAT = "pbfd_torch rollout 6"
 
@@ -115,6 +118,17 @@ class Rollout:
     def solved(self) -> Tensor:
         """`[T, *batch]` bool."""
         return is_solved(self.status)
+
+    def at(self, articulation: Articulation, times: Array) -> DenseOutput:
+        """The motion at other times `[T]` [s] from the first recorded one to the last: q, v and the poses of the links, in all
+        worlds. articulation: the one that has moved, as in `simulator.articulation`. See `dense_output` for how right it is: it
+        takes the velocities for those at the recorded times, which is so with `EnergyMomentum` and `RungeKutta`. Raises
+        `InputError` for times outside, and for another articulation."""
+        sizes = (articulation.nq, articulation.nv)
+        if (self.q.shape[-1], self.v.shape[-1]) != sizes:
+            found = (self.q.shape[-1], self.v.shape[-1])
+            raise InputError(f"articulation has {sizes} coordinates and velocities: must be those of the rollout, {found}")
+        return dense_output(articulation, self.time, self.q, self.v, times)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes a compressed .npz with one array per attribute and `meta`, a JSON text. The file appears whole or not at all.

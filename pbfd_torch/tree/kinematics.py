@@ -247,6 +247,20 @@ def coordinate_rates(articulation: Articulation, q: Tensor, v: Tensor) -> Tensor
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.q_order]
 
 
+def velocity_of_rates(articulation: Articulation, q: Tensor, rates: Tensor) -> Tensor:
+    """The velocity `[*batch, nv]` with which coordinates, their quaternions of any norm, change at `rates` `[*batch, nq]`: undoes
+    `coordinate_rates`. What changes a quaternion's norm is no motion and left out."""
+    t = articulation.topology
+    parts = [rates[..., t.scalar_q]]
+    if len(t.free_q):
+        parts.append(rates[..., t.free_q].flatten(-2))
+    if len(t.turning_q):
+        turning = q[..., t.turning_q]
+        spin = quaternion_multiply(quaternion_conjugate(turning), rates[..., t.turning_q])
+        parts.append((2 * spin[..., 1:] / turning.square().sum(-1, keepdim=True)).flatten(-2))
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)[..., t.v_order]
+
+
 def difference(articulation: Articulation, start: Tensor, end: Tensor) -> Tensor:
     """Tangent vector `[*batch, nv]` that takes `start` to `end`: retract(start, difference(start, end)) = end. Angles of ball and
     free joints come out in [0, π]; hinge angles are plain differences."""
