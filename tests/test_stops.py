@@ -24,6 +24,7 @@ from pbfd_torch.terms.contact import Contact
 from pbfd_torch.terms.coulomb_friction import CoulombFriction
 from pbfd_torch.terms.normal_force import NormalForce
 from tests.gradient_checks import PRECISE
+from tests.random_trees import generator
 from tests.touching_bodies import free_bodies, posed
 
 GRAVITY, SPEED = boxes.GRAVITY, 1.0
@@ -214,6 +215,31 @@ def test_values_are_the_same_to_the_bit() -> None:
     speed = torch.full_like(MU, SPEED)
     carrying = slid(EventSimulator, speed.clone().requires_grad_(), MU, 0.05)[0]
     assert torch.equal(slid(EventSimulator, speed, MU, 0.05)[0], carrying.detach())
+
+
+def test_a_robot_that_lands() -> None:
+    """A quadruped's feet are struck, slide, and stop, several at once: a cut is made only where the instant is found, so that the
+    derivatives by its start are those of central differences, 1e-5 of them."""
+    setup = SCENES["quadruped"](worlds=1)
+    change = torch.randn(setup.v.shape[-1], dtype=torch.float64, generator=generator(0))
+
+    def ended(by: Tensor) -> tuple[Tensor, int]:
+        simulator = EventSimulator(setup.scene, 0.01, RungeKutta(surplus=math.inf), PRECISE)
+        state = simulator.initial_state(setup.q.expand(len(by), -1), setup.v + by[:, None] * change)
+        cuts = 0
+        for _ in range(60):
+            state, solution = simulator.step(state)
+            assert solution.steps is not None
+            cuts += int((solution.steps - 1).sum())
+        return state.q[:, :3].sum(-1), cuts
+
+    given = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    end, cuts = ended(given)
+    assert cuts > 0
+    (found,) = torch.autograd.grad(end.sum(), given)
+    with torch.no_grad():
+        around, _ = ended(torch.tensor([1e-6, -1e-6], dtype=torch.float64))
+    assert float(found) == pytest.approx(float(around[0] - around[1]) / 2e-6, rel=1e-5)
 
 
 # What is left alone -----------------------------------------------------------------------------------------------------------

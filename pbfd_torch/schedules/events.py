@@ -19,7 +19,7 @@ from pbfd_torch.integrators.integrator import S
 from pbfd_torch.integrators.runge_kutta import standing
 from pbfd_torch.schedules.adaptive import BRINK, CUTS, REST
 from pbfd_torch.schedules.composed import Composed
-from pbfd_torch.schedules.stops import Reached, at_stop, stopping
+from pbfd_torch.schedules.stops import Reached, at_stop, stopping, stops_found
 from pbfd_torch.solvers.objective import Solution
 from pbfd_torch.solvers.per_world import mapped
 from pbfd_torch.stepping.stepper import Stepper
@@ -32,6 +32,8 @@ from pbfd_torch.tree.kinematics import retract
 
 Make = Callable[[Any, Any, Tensor | None], tuple[Any, Solution]]
 """Makes a step of a stepper from a state under a control: where it ends, and how it was solved."""
+Instant = Callable[[Reached, Stepper[Any], tuple[Any, Any], Tensor | None, Tensor], tuple[Tensor, Any, Solution]]
+"""Finds when something happens in a step, which is known nearly, with its derivatives, and the state there."""
 LATER = (1e-6, 1e-5, 1e-4, 1e-3)  # of the step, after the instant: when it is felt how hard something touches
 
 
@@ -50,55 +52,75 @@ def made_with_events(make: Make, stepper: Stepper[S], state: S, control: Tensor 
     solution = replaced(solution, steps=torch.ones_like(solution.status))
     if cuts == 0 or solution.strike is None:
         return end, solution
-    strike, stopped = solution.strike, stopping(stepper, state, end, control)
-    size = stepper.step_size.detach().expand(strike.shape)
-    struck = (strike < 1) & (strike > BRINK) & ((1 - strike) * size >= REST * stepper.dt)
-    for cut, when in ((struck, strike), (stopped, None)):
-        index = None if cut is None else cut.reshape(-1).nonzero().squeeze(-1)
-        if index is None or len(index) == 0:
+    strike, size = solution.strike, stepper.step_size.detach().expand(solution.strike.shape)
+    stops, solution = _stops(make, stepper, (state, end), control, solution)
+    instants: tuple[tuple[Tensor, Instant], ...] = ((strike, _at_strike), (stops, at_stop))
+    for share, instant in instants:
+        # what is left after `share` of a step is worth a part of its own
+        cut = (share < 1) & (share > BRINK) & ((1 - share) * size >= REST * stepper.dt)
+        index = cut.reshape(-1).nonzero().squeeze(-1)
+        if len(index) == 0:
             continue
         worlds, everywhere = Worlds(tuple(size.shape), index), torch.ones_like(index, dtype=torch.bool)
         held = None if control is None else worlds.pick(control, 1)
-        ends = state.take(worlds), end.take(worlds)
-        after, parts = _cut(make, stepper.take(worlds), ends, held, None if when is None else worlds.rows(when), cuts)
-        end, solution = put(end, after, worlds, everywhere), _joined(solution, worlds, parts)
+        part, ends, at = stepper.take(worlds), (state.take(worlds), end.take(worlds)), worlds.rows(share) * worlds.rows(size)
+        at, there, first = instant(_reaching(make, part, held), part, ends, held, at)
+        a, integrator, whole = part.scene.articulation, part.integrator, part.step_size.expand(index.shape)
+        rest = part.sized(whole - at)
+        after, last = made_with_events(make, rest, integrator.resized(a, there, at, rest.step_size), held, cuts - 1)
+        after = integrator.resized(a, after, rest.step_size, whole)
+        after = replaced(after, hazards=there.hazards | after.hazards)
+        end, solution = put(end, after, worlds, everywhere), _joined(solution, worlds, (first, last))
     return end, solution
 
 
-def _cut(
-    make: Make, stepper: Stepper[S], ends: tuple[S, S], control: Tensor | None, strike: Tensor | None, cuts: int
-) -> tuple[S, tuple[Solution, Solution]]:
-    """A step in two parts, up to where something strikes, after about a share `strike` `[n]` of it, or None: where something stops
-    sliding: the state after it, and how both were made. ends: the states before the step and after it as a whole."""
-    a, integrator, whole = stepper.scene.articulation, stepper.integrator, stepper.step_size.expand(ends[0].time.shape)
+def _reaching(make: Make, stepper: Stepper[Any], control: Tensor | None) -> Reached:
+    """What makes shorter steps from the states that a stepper's steps begin in."""
+    a, integrator = stepper.scene.articulation, stepper.integrator
 
-    def reached(start: S, time: Tensor) -> tuple[S, Solution]:
-        return make(stepper.sized(time), integrator.resized(a, start, whole, time), control)
+    def reached(start: Any, time: Tensor) -> tuple[Any, Solution]:
+        begin = integrator.resized(a, start, stepper.step_size.expand(time.shape), time)
+        return make(stepper.sized(time), begin, control)
 
-    if strike is None:
-        at, there, first = at_stop(reached, stepper, ends, control, whole.detach() - REST * stepper.dt)
-    else:
-        at, there, first = _at_strike(reached, stepper, ends[0], control, strike * whole.detach())
-    rest = stepper.sized(whole - at)
-    after, last = made_with_events(make, rest, integrator.resized(a, there, at, rest.step_size), control, cuts - 1)
-    after = integrator.resized(a, after, rest.step_size, whole)
-    return replaced(after, hazards=there.hazards | after.hazards), (first, last)
+    return reached
 
 
-def _at_strike(reached: Reached, stepper: Stepper[S], state: S, control: Tensor | None, at: Tensor) -> tuple[Tensor, S, Solution]:
-    """When something strikes after a state [s] `[n]`, about at `at`, the state there, and how it was made."""
-    end, solution = reached(state, at)
+def _stops(
+    make: Make, stepper: Stepper[S], ends: tuple[S, S], control: Tensor | None, solution: Solution
+) -> tuple[Tensor, Solution]:
+    """The share of a step after which something stops sliding, 1 where nothing does, `[*batch]`, and how the step was solved with
+    what this has cost. ends: the states before and after it."""
+    share = torch.ones_like(ends[0].time)
+    asked = stopping(stepper, *ends, control)
+    index = None if asked is None else asked.reshape(-1).nonzero().squeeze(-1)
+    if index is None or len(index) == 0:
+        return share, solution
+    worlds, everywhere = Worlds(tuple(share.shape), index), torch.ones_like(index, dtype=torch.bool)
+    held, part = None if control is None else worlds.pick(control, 1), stepper.take(worlds)
+    before, after = (x.take(worlds) for x in ends)
+    at, found, spent = stops_found(_reaching(make, part, held), part, (before, after), held)
+    spent = worlds.rows(solution.evaluations) + spent
+    solution = replaced(solution, evaluations=put(solution.evaluations, spent, worlds, everywhere))
+    return put(share, at / part.step_size.detach(), worlds, found), solution
+
+
+def _at_strike(
+    reached: Reached, stepper: Stepper[Any], ends: tuple[Any, Any], control: Tensor | None, at: Tensor
+) -> tuple[Tensor, Any, Solution]:
+    """When something strikes [s] `[n]`, about at `at`, the state there, and how it was made. ends: the states before and after the
+    step of the stepper."""
+    end, solution = reached(ends[0], at)
     spent = solution.evaluations
     for _ in range(CUTS):  # the way there is known better from nearby
         strike = solution.strike
         if strike is None or not bool((early := (strike < 1) & (strike > BRINK)).any()):
             break
         at = torch.where(early, strike * at, at)
-        end, solution = reached(state, at)
+        end, solution = reached(ends[0], at)
         spent = spent + torch.where(early, solution.evaluations, 0)
     if carries(end.q):
         at = at + _shift(stepper.sized(at), end, control, at)
-        end, solution = reached(state, at)
+        end, solution = reached(ends[0], at)
     return at, end, replaced(solution, evaluations=spent, steps=torch.ones_like(solution.status))
 
 

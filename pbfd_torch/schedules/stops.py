@@ -56,17 +56,17 @@ def stopping(stepper: Stepper[Any], state: State, end: State, control: Tensor | 
         return torch.zeros_like(asked).reshape(-1).index_copy(0, index, stops).reshape(asked.shape)
 
 
-def at_stop(
-    reached: Reached, stepper: Stepper[Any], ends: tuple[Any, Any], control: Tensor | None, latest: Tensor
-) -> tuple[Tensor, Any, Solution]:
-    """When the first of what slides stops [s] `[n]`, at `latest` [s] `[n]` if not before, the state there, and how it was made.
-    ends: the states before and after the step of the stepper; all worlds are such as `stopping` names. Where it is not found, as
-    where the slip jumps: some instant before it, or if none is known after it."""
+def stops_found(
+    reached: Reached, stepper: Stepper[Any], ends: tuple[Any, Any], control: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """When the first of what slides stops [s] `[n]`, in which worlds that has been found `[n]` bool, and what the search has cost
+    `[n]` int. It is not where the slip jumps, as through an impact. ends: the states before and after the step of the stepper; all
+    worlds are such as `stopping` names."""
     with torch.no_grad():
         before, after = (mapped_tensors(x, torch.detach) for x in ends)
         slide = _Slide(stepper, before, control)
         stops = slide.stops(after)
-        whole = stepper.step_size.detach().expand(latest.shape)
+        whole = stepper.step_size.detach().expand(before.time.shape)
         low, high, settled = torch.zeros_like(whole), whole, torch.zeros_like(whole, dtype=torch.bool)
         first = last = (low, slide.left(before, stops))  # the last two instants until which friction is fully there
         at, spent = SOONER * whole, torch.zeros_like(after.hazards)
@@ -85,16 +85,25 @@ def at_stop(
             inside = (brakes > 0) & (guess > low) & (guess < high)
             other = torch.where(low > 0, 0.5 * (low + high), SOONER * high)
             at = torch.where(settled, at, torch.where(inside, guess, other))
-        at = torch.where(settled, at, torch.where(low > 0, low, high))
-        settled, at = settled & (at < latest), torch.minimum(at, latest)
+    return at, settled, spent
+
+
+def at_stop(
+    reached: Reached, stepper: Stepper[Any], ends: tuple[Any, Any], control: Tensor | None, at: Tensor
+) -> tuple[Tensor, Any, Solution]:
+    """The instant at which sliding stops, which is `at` [s] `[n]`, with its derivatives, the state there, and how it was made.
+    Arguments: as in `stops_found`, which has found all of it."""
     there, solution = reached(ends[0], at)
-    if carries(there.q):
-        at = at + torch.where(settled, slide.shift(functools.partial(reached, before), there, at, stops), 0.0)
-        there, solution = reached(ends[0], at)
     with torch.no_grad():
-        gone = slide.gone(there, stops)
+        before, after = (mapped_tensors(x, torch.detach) for x in ends)
+        slide = _Slide(stepper, before, control)
+        stops = slide.stops(after)
+        gone = slide.gone(mapped_tensors(there, torch.detach), stops)
+    if carries(there.q):
+        at = at + slide.shift(functools.partial(reached, before), there, at, stops)
+        there, solution = reached(ends[0], at)
     there = Sliding(stepper, ends[0], control).stilled(there, at, gone)
-    return at, there, replaced(solution, evaluations=spent + solution.evaluations, steps=torch.ones_like(solution.status))
+    return at, there, replaced(solution, steps=torch.ones_like(solution.status))
 
 
 def _newer(where: Tensor, old: tuple[Tensor, Tensor], new: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
