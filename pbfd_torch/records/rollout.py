@@ -122,7 +122,7 @@ class Rollout:
     def at(self, articulation: Articulation, times: Array) -> DenseOutput:
         """The motion at other times `[T]` [s] from the first recorded one to the last: q, v and the poses of the links, in all
         worlds. articulation: the one that has moved, as in `simulator.articulation`. See `dense_output` for how right it is: it
-        takes the velocities for those at the recorded times, which is so with `EnergyMomentum` and `RungeKutta`. Raises
+        takes the velocities for those at the recorded times, which those of `ImplicitEuler` and `Variational` are not. Raises
         `InputError` for times outside, and for another articulation."""
         sizes = (articulation.nq, articulation.nv)
         if (self.q.shape[-1], self.v.shape[-1]) != sizes:
