@@ -99,7 +99,12 @@ class Sliding:
     def at(self, state: Velocities) -> tuple[Candidates, Tensor]:
         """The candidates at a state, and how they slip there `[*batch, n, 3]` [m/s]."""
         found, _ = self._candidates(state)
-        return found, found.slip(self._stepper.integrator.velocity(self._stepper.scene.articulation, state, self._size))
+        return found, found.slip(self.velocity(state))
+
+    def velocity(self, state: Velocities) -> Tensor:
+        """That of a state, `[*batch, nv]`."""
+        found: Tensor = self._stepper.integrator.velocity(self._stepper.scene.articulation, state, self._size)
+        return found
 
     def stilled(self, there: Velocities, at: Tensor, which: Tensor) -> Velocities:
         """The state `there` after a step of `at` [s] `[*batch]` from the start, its velocity the same, but for what comes next the

@@ -116,7 +116,8 @@ class _Slide:
     def __init__(self, stepper: Stepper[Any], state: Velocities, control: Tensor | None) -> None:
         self._sliding = Sliding(stepper, state, control)
         self.least = self._sliding.speed.min()
-        start, self._slip = self._sliding.at(state)
+        start = self._sliding.start
+        self._slip = start.slip(self._sliding.velocity(state))
         # the velocity alone does not tell: where friction has just stopped a slide it counts as if that went on
         average = start.slip(state.average)
         size = torch.minimum(slip_size(self._slip), slip_size(average))
