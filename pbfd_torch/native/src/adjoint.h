@@ -11,6 +11,7 @@ template <class L, int D, template <class, class, int> class Scheme> struct Adjo
   using typename Base::M, typename Base::T, typename Base::Written;
   using Base::aboard, Base::after, Base::asked, Base::column, Base::count, Base::parts, Base::plan, Base::residual;
   using Base::step, Base::sums, Base::tape, Base::world, Base::W;
+  static constexpr int AT_ONCE = 4;  // rows of derivatives that are followed side by side
   std::vector<Leg> legs;
   Routes<L>& routes = Base::template of_thread<Routes<L>>();
   using Base::Base;
@@ -26,7 +27,16 @@ template <class L, int D, template <class, class, int> class Scheme> struct Adjo
     Base::write(h);
     const M kept = Base::note(h);
     const Route<L>& way = route(h, leaves);
-    for (int r = 0; r < asked->rows; r++) seed(r, kept, way), follow(h, way), hand_over(r);
+    int r = 0;
+    for (; r + AT_ONCE <= asked->rows; r += AT_ONCE) rows<AT_ONCE>(r, h, kept, way);
+    for (; r < asked->rows; r++) rows<1>(r, h, kept, way);
+  }
+  // R rows from the first on.
+  template <int R> void rows(int first, int h, M kept, const Route<L>& way) {
+    sums.resize(std::max(sums.size(), size_t(R) * way.places()));
+    for (int r = 0; r < R; r++) sums[r] = L(0), seed<R>(first, r, kept, way);
+    follow<R>(h, way);
+    for (int r = 0; r < R; r++) hand_over<R>(first, r);
   }
 
   // From the state after the step through its parts, of each from its end and then from its balance, to what it was made of.
@@ -44,58 +54,57 @@ template <class L, int D, template <class, class, int> class Scheme> struct Adjo
     Written::each(plan, [&](auto member, int width) {
       for (int j = 0; j < width; j++) all[0].seeds.push_back((after.*member)[j].node);
     });
-    const Route<L>& found = routes.along(tape, all);
-    sums.resize(std::max(sums.size(), size_t(found.places())));
-    sums[0] = L(0);
-    return found;
+    return routes.along(tape, all);
   }
 
-  void seed(int r, M which, const Route<L>& way) {
+  template <int R> void seed(int first, int r, M which, const Route<L>& way) {
     int k = 0, number = 0;
     Written::each(plan, [&](auto, int width) {
       for (int j = 0; j < width; j++) {
         L sum(0);
         for (int i = 0; i < W; i++) {
           if (!lane(which, i)) continue;
-          T x = *Base::template row<T>(asked->cotangent[k], (long(r) * asked->worlds + world[i]) * width + j, 1);
+          T x = *Base::template row<T>(asked->cotangent[k], (long(first + r) * asked->worlds + world[i]) * width + j, 1);
           if (asked->seen[k]) x += *Base::template row<T>(asked->seen[k], asked->at(step, world[i]) * width + j, 1);
           put(sum, i, x);
         }
-        sums[way.seed(number++)] = sum;
+        sums[R * way.seed(number++) + r] = sum;
       }
       k++;
     });
   }
 
-  void follow(int h, const Route<L>& way) {
+  template <int R> void follow(int h, const Route<L>& way) {
     int leg = 0, number = int(way.legs[0].seeds.size());
     for (int p = (1 << h) - 1; p >= 0; p--) {
       const int n = plan.nv;
-      way.follow(leg++, tape, sums.data());
-      for (int i = 0; i < W; i++) {
-        for (int j = 0; j < n; j++) column[j] = lane(sums[parts[p].delta + j], i);
-        parts[p].jacobian[i].solve_transposed(column.data());
-        for (int j = 0; j < n; j++) put(sums[way.seed(number + j)], i, -column[j]);
-      }
+      way.template follow<R>(leg++, tape, sums.data());
+      for (int i = 0; i < W; i++)
+        for (int r = 0; r < R; r++) {
+          for (int j = 0; j < n; j++) column[j] = lane(sums[R * (parts[p].delta + j) + r], i);
+          parts[p].jacobian[i].solve_transposed(column.data());
+          for (int j = 0; j < n; j++) put(sums[R * way.seed(number + j) + r], i, -column[j]);
+        }
       number += n;
-      way.follow(leg++, tape, sums.data());
+      way.template follow<R>(leg++, tape, sums.data());
     }
-    way.follow(leg, tape, sums.data());
+    way.template follow<R>(leg, tape, sums.data());
   }
 
   // What the leaves have gathered, in the order in which they were loaded.
-  void hand_over(int r) {
+  template <int R> void hand_over(int first, int r) {
     int k = 0, leaf = 1;
     auto keep = [&](T* array, long rows, int width, bool sum) {
-      for (int j = 0; j < width; j++, leaf++) {
+      for (int j = 0; j < width; j++, leaf++)
         for (int i = 0; i < aboard; i++) {
           T& x = array[(rows + world[i]) * width + j];
-          x = lane(sums[leaf], i) + (sum ? x : T(0));
+          x = lane(sums[R * leaf + r], i) + (sum ? x : T(0));
         }
-      }
     };
-    Written::each(plan, [&](auto, int width) { keep(static_cast<T*>(asked->cotangent[k++]), long(r) * asked->worlds, width, false); });
-    keep(asked->by_control, (long(r) * asked->steps + step) * asked->worlds, plan.nu, false);
+    Written::each(plan, [&](auto, int width) {
+      keep(static_cast<T*>(asked->cotangent[k++]), long(first + r) * asked->worlds, width, false);
+    });
+    keep(asked->by_control, (long(first + r) * asked->steps + step) * asked->worlds, plan.nu, false);
     if (asked->by_dt) keep(asked->by_dt, 0, 1, true);
     if (asked->by_number) keep(asked->by_number, 0, count(), true);
   }

@@ -89,16 +89,20 @@ template <class L> struct Route {
     }
   }
 
-  // One of the legs; there is nothing at place 0.
-  void follow(int leg, const Tape<L>& tape, L* sums) const {
-    const L* slopes = tape.slopes.data();
+  // One of the legs, of R derivatives side by side at each place; there is nothing at place 0.
+  template <int R> void follow(int leg, const Tape<L>& tape, L* sums) const {
+    const L *slopes = tape.slopes.data(), zero(0);
     const Term *term = terms.data() + (leg ? ends[leg - 1] : 0), *end = terms.data() + ends[leg];
-    L sum(0);
+    L sum[R];
+    for (L& x : sum) x = zero;
     for (; term < end; term++) {
-      const L d = sums[term->from];
-      // the slope of what was not selected may be anything
-      sum = fma(select(d != L(0), slopes[term->slope], L(0)), d, kept(sum, term->more));
-      sums[term->to] = sum;
+      const L slope = slopes[term->slope], *d = sums + R * term->from;
+      L* to = sums + R * term->to;
+      for (int r = 0; r < R; r++) {
+        // the slope of what was not selected may be anything
+        sum[r] = fma(select(d[r] != zero, slope, zero), d[r], kept(sum[r], term->more));
+        to[r] = sum[r];
+      }
     }
   }
 };
