@@ -16,6 +16,7 @@ import runpy
 import shlex
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -45,6 +46,9 @@ FLAGS = [
     "-Wno-bitwise-instead-of-logical",  # of Clang's: the mask of one world is a bool
 ]
 
+# How the objects are linked: what is not the interface stays inside.
+LINK = ["-shared", *([f"-Wl,--version-script={SOURCES / 'exports.map'}"] if sys.platform == "linux" else [])]
+
 # Which variants, by name; else all of them in a wheel, and the one that this processor loads in an editable installation.
 TARGETS = os.environ.get("PBFD_NATIVE_TARGETS", "")
 
@@ -66,14 +70,14 @@ def compiled(file: Path, flags: list[str]) -> str:
     given = shlex.split(os.environ.get("CXXFLAGS", "")), shlex.split(os.environ.get("LDFLAGS", ""))
     strict = ["-Werror"] if STRICT else []
     command = [*compiler(), *FLAGS, *flags, *strict, *given[0]]
-    kept = Path(CACHE, digest([*command, *given[1]]) + ".so") if CACHE else None
+    kept = Path(CACHE, digest([*command, *LINK, *given[1]]) + ".so") if CACHE else None
     if kept is not None and kept.exists():
         shutil.copy(kept, file)
         return ""
     with tempfile.TemporaryDirectory() as room, ThreadPoolExecutor() as threads:
         objects = {unit: str(Path(room, unit.stem + ".o")) for unit in sorted(SOURCES.glob("*.cpp"))}
         said = list(threads.map(lambda unit: run([*command, "-c", str(unit), "-o", objects[unit]]), objects))
-        failure = next(filter(None, said), "") or run([*command, "-shared", *objects.values(), *given[1], "-o", str(file)])
+        failure = next(filter(None, said), "") or run([*command, *LINK, *objects.values(), *given[1], "-o", str(file)])
     if not failure and kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, kept)
