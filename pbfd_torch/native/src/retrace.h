@@ -46,8 +46,10 @@ template <class L, int D, template <class, class, int> class Scheme> struct Retr
     std::vector<Square<T>> jacobian;
   };
 
+  // numbers alone, which J is of
   const Plan<L, D>& plain;
   Numbers<L>& own;
+  // the same written down
   V* numbers;
   Plan<V, D> plan;
   Balance<L, L, D> exact;
@@ -55,12 +57,12 @@ template <class L, int D, template <class, class, int> class Scheme> struct Retr
   Balance<V, V, D> balance;
   Scheme<V, V, D> scheme;
   Tape<L>& tape;
-  State now;
-  Written before, after;
-  L *ended, *better, *guessed, *moved, *stiffness;
-  V *q, *delta, *guess, whole;
-  std::vector<int> residual;  // nodes [parts · nv]
-  std::vector<L>& sums;  // room for a derivative of each value
+  State now;               // the state before a part, as numbers
+  Written before, after;   // and written down, and that after it
+  L *ended, *better, *guessed, *moved, *stiffness;  // where the part has ended; room
+  V *q, *delta, *guess, whole;                      // q ⊕ δ, δ; room; Δt
+  std::vector<int> residual;                        // where on the tape r is [parts · nv]
+  std::vector<L>& sums;                             // room for a derivative of each value
   std::vector<Part> parts;
   std::vector<T> column;
 
