@@ -21,6 +21,7 @@ from pbfd_torch.integrators.implicit_euler import ImplicitEuler
 from pbfd_torch.integrators.integrator import Integrator
 from pbfd_torch.integrators.variational import Variational
 from pbfd_torch.models import SCENES
+from pbfd_torch.native import stepper as native_stepper
 from pbfd_torch.native.stepper import NativeStepper
 from pbfd_torch.solvers.fallbacks import Fallbacks
 from pbfd_torch.solvers.objective import Status
@@ -174,6 +175,21 @@ def test_a_motion_in_one_call() -> None:
     tilt = [torch.randn(path.q.shape, dtype=v.dtype, generator=random) for _ in range(2)]
     ((torch.stack(q) * tilt[0]).sum() + (torch.stack(speed) * tilt[1]).sum()).backward()
     assert off([v.grad, held.grad], list(found)) <= 1e-8  # what 24 steps through contact make of rounding
+
+
+def test_a_long_motion_without_controls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made in several calls of the core and followed back in one: as under controls of zero, to the bit."""
+    monkeypatch.setattr(native_stepper, "KEPT_AT_ONCE", 3 * WORLDS)
+    simulator, state, control = under_way("hopper")
+    found = []
+    for controls in (None, torch.zeros(8, *control.shape, dtype=control.dtype)):
+        v = state.v.clone().requires_grad_()
+        path = simulator.trajectory(replaced(state, v=v), controls, None if controls is not None else 8)
+        path.q.sum().backward()
+        found.append(v.grad)
+    assert found[0] is not None
+    assert found[1] is not None
+    assert torch.equal(found[0], found[1])
 
 
 @pytest.mark.parametrize("own", [False, True])

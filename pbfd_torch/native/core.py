@@ -202,12 +202,13 @@ class Core:
         self._calls.share(self._scheme.function, asked, asked.worlds, asked.worlds * asked.steps // WORTH_A_BLOCK)
         return journey
 
-    def path(self, journeys: list[Journey]) -> Path:
-        """Journeys, each of which goes on from the end of the last one, as steps that may be followed back."""
+    def path(self, journeys: list[Journey], held: bool) -> Path:
+        """Journeys, each of which goes on from the end of the last one, as steps that may be followed back. held: under one control
+        for all steps."""
         first = journeys[0]
         found = {name: torch.cat([x.found[name] for x in journeys]) for name in first.found}
         trails = [Trail.of(x.ways) for x in journeys if x.ways is not None]
-        control = first.control if len(journeys) == 1 else torch.cat([x.control for x in journeys])
+        control = first.control if held or len(journeys) == 1 else torch.cat([x.control for x in journeys])
         poses = torch.cat([first.poses, *(x.poses[1:] for x in journeys[1:])])
         return Path(first.given, found, control, poses, Trail.joined(trails))
 

@@ -128,7 +128,7 @@ class NativeStepper(Generic[S]):
         journey = self._went(state, None if control is None else control[None], ())
         solution, ways = journey.solution, journey.ways
         way = Way(solution.q) if ways is None else ways.way(self.integrator, solution.q)
-        return self._restored(state, journey.found, journey.other(state.time + self.step_size)), solution, way
+        return self.restored(state, journey.found, journey.other(state.time + self.step_size)), solution, way
 
     def run(self, state: S, controls: Tensor | None, steps: int) -> tuple[S, Solution]:
         """The states after each of so many steps, `[steps, *batch, ...]`, and how each was solved; see `stretch`."""
@@ -139,7 +139,7 @@ class NativeStepper(Generic[S]):
         """So many steps of all worlds under controls `[steps, *, nu]`, or `[1, *, nu]` for all of them (None: zero)."""
         journey = self._went(state, controls, (steps,))
         other = journey.other(passed(state.time, self.step_size, steps)[1:])
-        make = partial(self._restored, state)
+        make = partial(self.restored, state)
         return Stretch(state.time, journey.given, journey.found, other, journey.solution, journey.frames, make)
 
     # followed back ----------------------------------------------------------------------------------------------------------
@@ -153,10 +153,6 @@ class NativeStepper(Generic[S]):
         """See `Descending`."""
         return self._scheme.fields(self.complete(state), self._core.plan)
 
-    def restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
-        """See `Descending`."""
-        return self._restored(state, found, other)
-
     def precise(self, stepper: EagerStepper[S], plain: EagerStepper[S]) -> tuple[NativeStepper[S], Numbers] | None:
         """See `Descending`."""
         plan = planned_with_derivatives(stepper)
@@ -169,15 +165,16 @@ class NativeStepper(Generic[S]):
         """See `Descending`."""
         start, journeys, worlds = state, list[Journey](), max(1, state.q[..., 0].numel())
         part = max(1, KEPT_AT_ONCE // worlds)
+        one = controls is None or len(controls) == 1
         for first in range(0, steps, part):
             count = min(part, steps - first)
-            held = controls if controls is None or len(controls) == 1 else controls[first : first + count]
+            held = controls if one or controls is None else controls[first : first + count]
             if journeys:
                 found = {name: x[-1] for name, x in journeys[-1].found.items()}
                 other = {name: x[-1] for name, x in journeys[-1].other(passed(state.time, self.step_size, part)[1:]).items()}
-                state = self._restored(state, found, other)
+                state = self.restored(state, found, other)
             journeys.append(self._went(state, held, (count,), led=True))
-        path = self._core.path(journeys)
+        path = self._core.path(journeys, one)
         times = passed(start.time, self.step_size, steps)[1:]
         hazards = torch.cat([x.counted["hazards"] for x in journeys])
         solution = mapped(lambda *x: torch.cat(x), *(x.solution for x in journeys))
@@ -235,8 +232,8 @@ class NativeStepper(Generic[S]):
             controls = state.q.new_zeros(1, self.scene.nu)
         return self._core.go(self.complete(state), spread(controls, state.q.shape[:-1]), steps, self._accuracy, led)
 
-    def _restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
-        """The states after steps from a state, of the core's fields and what else they have."""
+    def restored(self, state: S, found: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> S:
+        """See `Descending`: of the core's fields and what else states have."""
         plan = self._core.plan
         fields, memory, time = self._scheme.restored(dict(found), plan), state.memory, other["time"]
         if plan.remembered:
