@@ -66,11 +66,10 @@ class Walker(Generic[S]):
         maker = linked.maker(plain, state)
         if not isinstance(maker, Descending) or not maker.descends:
             return None
+        wide = precise(plain)
         if not active:
-            wide = precise(plain)
             back = maker if wide is plain else linked.engine(wide)
             return cls(linked, maker, back, None) if isinstance(back, Descending) else None
-        wide = precise(plain)
         if not _known(linked, maker, wide):
             return None
         known = maker.precise(precise(linked.stepper), wide)
